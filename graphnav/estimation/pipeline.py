@@ -328,7 +328,7 @@ def _solve(
             out[name],
             notes=(*notes, *out[name].notes),
             detections=found.detections.all,
-            excluded=(*found.unmeasured.copies, *faults),
+            excluded=(*found.unmeasured.list_held(found.noise.spacing), *faults),
             noise=found.noise,
             passes=dict(passes),
             separation=apart,

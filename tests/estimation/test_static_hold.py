@@ -10,7 +10,9 @@ import pytest
 
 import graphnav
 from graphnav.app.scores import score
+from graphnav.config import parse_settings
 from graphnav.core.earth import LocalFrame
+from graphnav.core.notes import Note
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_unmeasured, mark_copies, mark_interpolated
 from graphnav.evaluation.metrics import summarise
 from graphnav.recording import Gnss, Recording
@@ -71,6 +73,20 @@ def test_repeats_that_digits_explain_are_no_copies(drive: Recording) -> None:
     assert mark_copies(gnss).any()
     assert drop_unmeasured(drive) == (drive, UnmeasuredRows())
     assert not mark_copies(coarse).any()
+
+
+def test_copies_that_last_are_excluded_and_single_ones_beside_their_fix_are_not(drive: Recording) -> None:
+    gnss = drive.gnss
+    assert gnss is not None
+    row = np.arange(len(gnss.t))
+    row[100] = 99  # 0.2 s behind
+    row[200:220] = 199
+    used = replace(drive, gnss=replace(gnss, llh=gnss.llh[row]))
+    for mode, expected in (({}, [(200, 219)]), ({"noise": {"spacing": 0.0}}, [(100, 100), (200, 219)])):
+        (solution,) = graphnav.run(used, parse_settings(mode), ("ekf",)).values()
+        spans = [(one.t_start, one.t_end) for one in solution.excluded if one.kind == "gnss_position"]
+        assert [(gnss.t[a], gnss.t[b]) for a, b in expected] == spans
+        assert "gnss.copies" in [note.key for note in solution.notes if isinstance(note, Note)]
 
 
 def interpolate(gnss: Gnss, more: float) -> Gnss:

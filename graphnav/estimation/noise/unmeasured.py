@@ -37,6 +37,10 @@ class UnmeasuredRows:
     interpolated: int = 0
     filled: int = 0  # in gaps of the IMU
 
+    def list_held(self, spacing: float) -> tuple[ExcludedSpan, ...]:
+        """Copies that take a fix away where one is used every `spacing`, s; others stand beside the fix they repeat."""
+        return tuple(one for one in self.copies if one.t_end - one.t_start >= spacing)
+
 
 def drop_unmeasured(recording: Recording) -> tuple[Recording, UnmeasuredRows]:
     """A recording without rows of fixes within the IMU's time that are no measurements, and what these are."""
