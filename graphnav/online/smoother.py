@@ -297,11 +297,11 @@ class Smoother:
         noise, until = found.keep_false_stops(tracker.noise), float(estimation.task.times[-1])
         judged = until - PATIENCE  # of a fault that has just begun, evidence may still know too little
         if tracker.opened and not found.anew:
-            self._catch_up = CatchUp(tracker.restart_settled(noise, self._setup, judged))
+            self._catch_up = CatchUp(tracker.restart_settled(noise, self._setup, judged), points=found.points)
         else:
             again = self._track(found.start, self._began, noise)
             again.adopt(tracker, found.stationary, until, self._times, judged)
-            self._catch_up = CatchUp(again, self._times)
+            self._catch_up = CatchUp(again, self._times, found.points)
             if self._found is not None:
                 self._found = found.start
 
