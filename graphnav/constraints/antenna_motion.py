@@ -49,7 +49,7 @@ def compute_acceleration(
     ahead : (N, 1) s, h.
     """
     R, h = states.R_nb, np.clip(ahead, -LINEAR_OFFSET, LINEAR_OFFSET)
-    jerk = slope + np.cross(gyro - states.bg, force)
+    jerk = slope + mv(rotation.skew(gyro - states.bg), force)
     then = force - states.ba + jerk * h
     by_bg = R @ rotation.skew(force) * h[..., None]
     by_time = np.where(h == ahead, mv(R, jerk), 0.0)

@@ -18,7 +18,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, Parameter
 from graphnav.estimation.factor_graph.tree_window import TreeWindow
 from graphnav.estimation.faults.verdicts import Verdicts
-from graphnav.estimation.faults.watch import Watch
+from graphnav.estimation.faults.watch import PATIENCE, Watch
 from graphnav.estimation.fixing import (
     LOST_ERRORS,
     LOST_PLACE,
@@ -46,6 +46,7 @@ from graphnav.recording import Recording
 
 _PLACE_SIGMA = 1000.0  # m, prior 1-sigma of the position of a stop
 _FEWEST_FOR_PERIOD = 5  # fixes from which their period is known
+_FIXES_FOR_A_STATE = 3  # of place: the first tells of it, the second of velocity, the third of attitude
 _ENGINES: dict[str, type[Window]] = {"window": Window, "isam2": TreeWindow}
 
 
@@ -86,6 +87,7 @@ class Chain:
         self._head_held = Held()
         self.epochs = self.fixed = 0  # settled keyframes with carriers, and those of them that are fixed
         self._parameters: dict[str, Parameter] = {}
+        self._gaps = np.empty(0)  # s, ends of gaps of the IMU that are filled in
         # whether some state has moved so far from its linearisation point that it may have to be relinearised
         self._turned = False
 
@@ -202,7 +204,10 @@ class Chain:
         while k < (len(problem.t) if end is None else end):
             turn = max(turn, self._push(problem, k, ahead))
             ahead = None
-            fault = self.window.stages[-1].fault
+            fault, tests = self.window.stages[-1].fault, self.window.newest.tests
+            if tests is not None and self._follows_gap(float(problem.t[k])):
+                self.window.watch(tests.forget_onsets())
+                fault = None
             if fault is not None and problem.t[k] > self.judged + SAME_TIME:
                 again = self.verdicts.settle(*fault, now=float(problem.t[k]))
                 if again < problem.t[first] - SAME_TIME:
@@ -217,6 +222,23 @@ class Chain:
             k += 1
         self._turned |= turn > self.window.turn
         return None
+
+    def _note_gaps(self, ends: Array) -> None:
+        """Remember where gaps of the IMU end (s) that are filled in."""
+        ends = np.union1d(self._gaps[self._gaps > self.head], ends)
+        self._gaps = ends[np.append(np.diff(ends) > SAME_TIME, True)[: len(ends)]]
+
+    def _follows_gap(self, t: float) -> bool:
+        """Whether a keyframe is behind a gap of the IMU with so few fixes since that what was filled in, as an error of
+        place, velocity and attitude, explains them as well as a fault of theirs.
+        """
+        for end in self._gaps[(self._gaps <= t + SAME_TIME) & (self._gaps > t - PATIENCE)].tolist():
+            for name, times in self.verdicts.times.items():
+                before = int(times.searchsorted(end))
+                since = int(times.searchsorted(t + SAME_TIME)) - before
+                if since <= _FIXES_FOR_A_STATE and (not before or self.verdicts.used[name][before - 1] > 0.0):
+                    return True
+        return False
 
     def _push(self, problem: Problem, k: int, ahead: Predicted | None) -> float:
         place, nodes = self._place(problem, k)

@@ -10,8 +10,10 @@ from dataclasses import replace
 
 from graphnav.core.findings import Finding
 from graphnav.core.notes import Note, format_count
+from graphnav.online.neighbours import FilledRows
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import inspect
+from graphnav.recording.plausibility.filled import describe_filled
 
 _FEWEST_IMU_ROWS = 50  # rows of the IMU, at least
 _MOST_LEFT_OUT = 0.5  # share of a sensor's rows; above it they are not single outliers
@@ -38,6 +40,14 @@ def check_rows(recording: Recording) -> tuple[Finding, ...]:
     until = f"rows sent up to {recording.end:.1f} s"
     keys = " (keys of a live source are in its first line)" if recording.source is None else ""
     return tuple(replace(f, sentence=f"{until}: {f.sentence}{keys}") for f in findings if f.severity != "note")
+
+
+def check_filled(filled: FilledRows) -> tuple[Finding, ...]:
+    """The finding on rows of the IMU that no sensor measured, if there are any."""
+    if not filled.count:
+        return ()
+    span, at = filled.longest
+    return (describe_filled(filled.count, filled.stretches, span, f"{at:.1f} s"),)
 
 
 def check_counts(counts: Counter[str]) -> tuple[Note, ...]:

@@ -25,6 +25,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.findings import Finding
 from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
 from graphnav.detectors import detect
 from graphnav.detectors.base import subtract_spans
 from graphnav.estimation.alignment import Alignment
@@ -39,6 +40,8 @@ from graphnav.estimation.noise.tails import widen_unweighted
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
+from graphnav.estimation.solvers.linearise import shift
+from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE
 from graphnav.online.checks import check_rows
 from graphnav.online.fixes import compute_unit
 from graphnav.online.raw import drop_ambiguities
@@ -64,11 +67,21 @@ class EstimationResult:
     excluded: tuple[ExcludedSpan, ...]  # spans that the noise model excludes
     doubts: tuple[Finding, ...]  # findings on units, axes and clocks
     start: Alignment
+    points: SmoothedPoints  # of the keyframes that it was estimated from
     anew: bool  # whether constants are free, or no longer, or the start is another: all states so far are concerned
 
     def keep_false_stops(self, before: NoiseModel) -> NoiseModel:
         """The noise model with the false stops of the one in use as well."""
         return replace(self.noise, false_stops=unite_stops(before.false_stops, self.noise.false_stops))
+
+
+@dataclass(frozen=True)
+class SmoothedPoints:
+    """Smoothed states and parameters of keyframes."""
+
+    t: Array  # (K,) s
+    states: States  # (K,)
+    values: dict[str, Array]  # (K, k) by parameter
 
 
 @dataclass(frozen=True)
@@ -131,12 +144,14 @@ def run_estimation(task: EstimationTask) -> EstimationResult:
         else:  # they are states already, and need no other prior
             noise = replace(noise, freed=before.freed)
         anew = freed_anew or start is not task.found
-        used = apply_noise(found.base, noise)
+        used, smoothed = apply_noise(found.base, noise), found.estimate.points
+        values = {name: smoothed.values[:, shift(at)] for name, at in used.columns.items()}
+        points = SmoothedPoints(task.times, smoothed.states, values)
         words = (*describe_freed(noise.freed, task.recording), *describe_noise(noise, used))
         wrong = find_fault_spans(used)
         noise = widen_unweighted(used, _convert_unit(noise, base, task.unit))
         noise = replace(noise, false_stops=unite_stops(before.false_stops, false))
-        return EstimationResult(noise, words, stationary, wrong, check_rows(task.every), start, anew)
+        return EstimationResult(noise, words, stationary, wrong, check_rows(task.every), start, points, anew)
     except np.linalg.LinAlgError as error:
         raise EstimationError(str(error), key="solver.undetermined") from error
 
@@ -255,16 +270,47 @@ class CatchUp:
     ----------
     tracker : without keyframes.
     settled : (K,) s, keyframes that it is to process and that the other no longer has.
+    points : of an estimate with its noise model; where the tracker is far from them, it goes on from there.
     """
 
-    def __init__(self, tracker: Tracker, settled: Sequence[float] = ()) -> None:
-        self.tracker, self.settled = tracker, np.array(settled)
+    def __init__(self, tracker: Tracker, settled: Sequence[float] = (), points: SmoothedPoints | None = None) -> None:
+        self.tracker, self.settled, self._points = tracker, np.array(settled), points
+        self._revises = False
 
     def step(self, sensors: Sensors, other: Tracker) -> bool:
         """Process a few more keyframes of the other; True once it has caught up."""
         t, done = np.concatenate([self.settled, other.window.t]), len(self.tracker.window)
-        end = min(done + _REPLAYED_PORTION, len(t))
-        while end < len(t) and np.any(np.abs(self.tracker.stops[:, 0] - t[end - 1]) < SAME_TIME):
+        if self._revises:
+            self._revises = self.tracker.revise(sensors)
+            return False
+        known = len(t) if self._points is None else int(np.searchsorted(t, self._points.t[-1] + SAME_TIME))
+        if self._points is not None and done >= known:
+            self._revises, self._points = self._go_to(self._points), None
+            return False
+        end = min(done + _REPLAYED_PORTION, known)
+        while end < known and np.any(np.abs(self.tracker.stops[:, 0] - t[end - 1]) < SAME_TIME):
             end += 1  # the beginning of a stop is known only from later rows
         self.tracker.update(sensors, t[done:end])
-        return len(self.tracker.window) >= len(t)
+        return self._points is None and len(self.tracker.window) >= len(t)
+
+    def _go_to(self, points: SmoothedPoints) -> bool:
+        """Have all keyframes linearised at known points if one is far from them: a filter that begins with an unknown
+        heading may lead its smoother to another minimum.
+        """
+        window = self.tracker.window
+        at = np.searchsorted(points.t, window.t - SAME_TIME)
+        if not len(at) or at[-1] == len(points.t) or np.any(np.abs(points.t[at] - window.t) > SAME_TIME):
+            return False  # it has other keyframes
+        away = points.states[at].minus(window.read_states())
+        if np.linalg.norm(away[:, :3], axis=1).max() <= LINEAR_ATTITUDE:
+            return False
+        means = []
+        for stage, k in zip(window.stages, at.tolist(), strict=True):
+            message = stage.message
+            e = np.zeros(DIM + len(message.values))
+            e[:DIM] = points.states[k : k + 1].minus(message.state)[0]
+            for name in message.columns.keys() & points.values.keys():
+                e[message.columns[name]] = points.values[name][k] - message.get_value(name)
+            means.append(e)
+        window.linearise_at(means)
+        return True

@@ -14,7 +14,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.online.buffers import SAME, Buffer
 from graphnav.online.fixes import Fixes
-from graphnav.online.neighbours import Neighbours
+from graphnav.online.neighbours import FILLED, FilledRows, Neighbours
 from graphnav.online.raw import RAW, RawEpochs
 from graphnav.online.sanity import (
     ClockGuard,
@@ -71,6 +71,7 @@ class Sensors:
         self.gnss = Fixes(self.setup.gnss)
         # for a foot, of rates only: an impact lasts for less than a row
         self._neighbours = Neighbours(3 if self.setup.platform == "foot" else 6)
+        self.filled: FilledRows = self._neighbours.filled
         raw, tight = self.setup.raw_gnss, self.setup.is_tight(self.raw_settings.coupling)
         self.raw = RawEpochs(raw, self.raw_settings) if raw is not None and tight else None
 
@@ -233,7 +234,7 @@ class Sensors:
         """Process an IMU row if it is regular; returns False to leave it to `add`. `newest` is the time before it."""
         if not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest or self._clock.undecided:
             return False
-        if len(values) != _ROW_WIDTH["imu"] or not can_imu_read(values):
+        if len(values) != _ROW_WIDTH["imu"] or not can_imu_read(values) or self._neighbours.frozen:
             return False
         self._clock.remember(t, values)
         self.imu.append(t, values)
@@ -295,6 +296,9 @@ class Sensors:
         return None if reads else "beyond any sensor"
 
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
+        if t > self.imu.newest and self._neighbours.is_frozen(t, values):
+            self.counts[f"imu: {FILLED}"] += 1
+            return False
         if t <= self.oldest or (t < self.imu.newest - SAME and not self._clock.fits(t, self.imu.t)):
             self.counts[self._name_passed(t)] += 1
             if self._clock.hold(("imu", t, values)):

@@ -25,7 +25,7 @@ from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.online.ahead import Live, export
-from graphnav.online.checks import check_rows
+from graphnav.online.checks import check_filled, check_rows
 from graphnav.online.judgement import WindowJudge
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.noise_estimation import BackgroundEstimation, CatchUp, are_enough, start_estimation
@@ -258,7 +258,7 @@ class Smoother:
         return tracker
 
     def _take_findings(self, found: tuple[Finding, ...]) -> None:
-        self.findings = found
+        self.findings = found = (*found, *check_filled(self.sensors.filled))
         self._replace_notes("units", tuple(Note(f.key, f.sentence) for f in found))
 
     def _replace_notes(self, matter: str, words: tuple[str, ...]) -> None:
@@ -297,11 +297,11 @@ class Smoother:
         noise, until = found.keep_false_stops(tracker.noise), float(estimation.task.times[-1])
         judged = until - PATIENCE  # of a fault that has just begun, evidence may still know too little
         if tracker.opened and not found.anew:
-            self._catch_up = CatchUp(tracker.restart_settled(noise, self._setup, judged))
+            self._catch_up = CatchUp(tracker.restart_settled(noise, self._setup, judged), points=found.points)
         else:
             again = self._track(found.start, self._began, noise)
             again.adopt(tracker, found.stationary, until, self._times, judged)
-            self._catch_up = CatchUp(again, self._times)
+            self._catch_up = CatchUp(again, self._times, found.points)
             if self._found is not None:
                 self._found = found.start
 

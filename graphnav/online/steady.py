@@ -54,7 +54,7 @@ class Online(Smoother):
         sensors.check_form(row)
         self._rows += 1
         if self._rows >= _REPORTED_AFTER and not self._rows & (self._rows - 1):  # at powers of two
-            self._replace_notes("counts", check_counts(sensors.counts))
+            self._tell_counts()
         while rows:
             try:
                 super().add(*rows.pop(0))
@@ -78,7 +78,16 @@ class Online(Smoother):
             super().finish()
         except Exception as error:
             self._give_up(error)
+        self._tell_counts()
+
+    def _tell_counts(self) -> None:
+        """Note what the rows left out so far say of the sensors."""
         self._replace_notes("counts", check_counts(self.sensors.counts))
+        self._take_findings(tuple(f for f in self.findings if f.key != "imu.filled"))
+
+    def _restart(self, before: float, why: str) -> None:
+        super()._restart(before, why)
+        self._tell_counts()
 
     def _give_up(self, error: Exception) -> None:
         """Drop the piece that is being smoothed, and start anew with the next rows."""

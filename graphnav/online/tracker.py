@@ -151,8 +151,8 @@ class Tracker(Chain):
             problem, ahead = self._apply_noise(self._build(sensors, np.concatenate([before, times])), sensors), None
         self._parameters |= problem.parameters
         self._watch(problem, sensors)
-        redone = again[0] if again else np.inf
-        return BuiltKeyframes(problem, len(before), times, redone, None if ahead is None else ahead.keyframe)
+        prepared = None if ahead is None else ahead.keyframe
+        return BuiltKeyframes(problem, len(before), times, again[0] if again else np.inf, prepared)
 
     def _finish_keyframes(self) -> None:
         """Called when keyframes have entered."""
@@ -176,14 +176,13 @@ class Tracker(Chain):
         """
         lag, now = self.settings.solver.lag, sensors.imu.newest
         if self._turned or self.window.revising:
-            self._turned = False
-            if not self._revise(sensors) and self._settling:
+            if not self.revise(sensors) and self._settling:
                 self._settle(self.newest - lag)
         elif settling and self.window.leaving:
             self._settle(self.newest - lag)
         elif settling and self._tried < self.newest and self.newest - self._oldest > lag * (1.0 + 1.0 / _PORTIONS):
             self._tried, self._settling = self.newest, True
-            if not self._revise(sensors, always=self._robust):
+            if not self.revise(sensors, always={self.settings.gnss.kernel, self.settings.vehicle.kernel} != {"none"}):
                 self._settle(self.newest - lag)
         elif self.foot:
             return False
@@ -250,15 +249,12 @@ class Tracker(Chain):
         problem = replace(problem, constraints=tuple(added.get(c.name, c) for c in problem.constraints))
         return problem if problem.parameters.keys() <= self._parameters.keys() else None
 
-    def _revise(self, sensors: Sensors, always: bool = False) -> bool:
+    def revise(self, sensors: Sensors, always: bool = False) -> bool:
         """Relinearise as much as one row permits; False once nothing is left to do."""
+        self._turned = False
         more = self.window.revise(self.at_a_row, lambda *which: self._renew(sensors, *which), always)
         forget_rows(self.window.stages)
         return more
-
-    @property
-    def _robust(self) -> bool:
-        return {self.settings.gnss.kernel, self.settings.vehicle.kernel} != {"none"}
 
     def settle(self, sensors: Sensors) -> None:
         """Settle all keyframes: no more will come."""
@@ -367,6 +363,7 @@ class Tracker(Chain):
             recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known,
             self._steps.highest, complete, self._estimates_imu,
         )  # fmt: skip
+        self._note_gaps(problem.samples.bridged[:, 1])
         for k, t in enumerate(times[1:].tolist()):
             if t not in known:
                 self._motions[t] = ImuFactors(problem.intervals[k : k + 1], self.frame)
@@ -377,10 +374,8 @@ class Tracker(Chain):
 
         A few keyframes do not show the period of the fixes, nor their typical sigmas.
         """
-        spacing, fixes = (
-            find_node_spacing(self.settings.gnss.slow_times, find_fix_period(sensors.gnss.used)),
-            sensors.gnss,
-        )
+        fixes = sensors.gnss
+        spacing = find_node_spacing(self.settings.gnss.slow_times, find_fix_period(fixes.used))
         usual = TypicalSigmas(fixes.compute_unit, lambda k: fixes.compute_typical_sigmas(problem.t[k]), spacing)
         rows = tuple(c.convert_units(usual) for c in problem.constraints)
         noise = noise or self.noise

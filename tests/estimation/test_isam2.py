@@ -15,7 +15,7 @@ from graphnav import load
 from graphnav.config import Settings, parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import exp
-from graphnav.core.state import States
+from graphnav.core.state import DIM, States
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
@@ -32,11 +32,12 @@ from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.incremental import begin_at
 from graphnav.estimation.solvers.linearise import Step, list_node_steps
 from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.window import compute_turn_limit, make_first_message
+from graphnav.estimation.solvers.window import Window, compute_turn_limit, make_first_message
 from graphnav.recording import Recording
 
 Drive = tuple[Recording, States, Array]
@@ -104,6 +105,34 @@ def test_a_start_that_is_off_by_sixty_degrees_is_mended_by_relinearisation(built
     found = isam2(problem)
     assert apart(found, best).max() < 0.02
     assert np.abs(found.states.p - best.states.p).max() < 1e-3
+
+
+@pytest.mark.parametrize("engine", [Window, TreeWindow])
+def test_a_window_that_has_gone_astray_goes_on_from_states_that_it_is_given(
+    built: Problem, solved: Solution, engine: type[Window]
+) -> None:
+    mean, sigma = built.prior.mean, built.prior.sigma.copy()
+    assert mean is not None
+    wrong = replace(mean, R_nb=exp(np.array([[0.0, 0.0, 2.8]])) @ mean.R_nb)
+    sigma[0, 2] = 2.0
+    problem = replace(built, prior=replace(built.prior, mean=wrong, sigma=sigma))
+    best = batch(problem, solved.states, reintegrate=False)
+    window, steps = engine(begin_at(problem, None), compute_turn_limit(problem.imu_noise)), list_node_steps(problem)
+    for k in range(len(built.t)):
+        window.push(place(problem, k, steps))
+    assert np.abs(window.read_states().minus(best.states)[:, 2]).max() > 0.3
+    means = []
+    for k, stage in enumerate(window.stages):
+        e = np.zeros(DIM + len(stage.message.values))
+        e[:DIM] = solved.states[k : k + 1].minus(stage.message.state)[0]
+        for name, own in solved.parameters.items():
+            at = stage.message.columns[name]
+            node = np.searchsorted(own.t, stage.place.t + 1e-6, side="right") - 1
+            e[at] = own.value[node] - stage.message.get_value(name)
+        means.append(e)
+    window.linearise_at(means)
+    window.revise(len(window), lambda first, end: [place(problem, k, steps) for k in range(first, end)])
+    assert (np.abs(window.read_states().minus(best.states)) / sigmas(best)).max() < 0.02
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from graphnav.online.lines import format_line, format_lines, parse_row
 from graphnav.online.session import Session
 from graphnav.online.view import view
 from graphnav.recording import Recording
+from graphnav.recording.checks.overview import inspect
 
 QUICK = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
 TOLD = {"imu.force_scale", "imu.gyro_unit", "gnss.lat_lon", "imu.left_out", "gnss.left_out"}
@@ -71,6 +73,28 @@ def test_a_session_with_wrong_numbers_says_so(drive: Recording, how: str, keys: 
     assert found == keys
     assert early == found  # while it runs, not only at the end
     assert not online.failures
+
+
+def test_an_imu_that_is_stuck_is_told_of_as_offline_and_is_a_gap() -> None:
+    recording = oracle.drive(oracle.vehicle_path(130.0, 25.0), seed=3)[0].crop(20.0, 120.0)
+    imu, stuck = recording.imu, (recording.imu.t >= 70.0) & (recording.imu.t <= 95.0)
+    gyro, accel = imu.gyro.copy(), imu.accel.copy()
+    gyro[stuck], accel[stuck] = gyro[stuck][0], accel[stuck][0]
+    recording = replace(recording, imu=replace(imu, gyro=gyro, accel=accel))
+    online = Online(drop_rows(recording), QUICK)
+    for row in list_rows(recording)[1]:
+        online.add(row)
+    (told,) = (f for f in online.findings if f.key == "imu.filled")  # while it runs
+    online.finish()
+    (offline,) = (f for f in inspect(recording).findings if f.key == "imu.filled")
+    assert told.severity == offline.severity
+    assert abs(online.sensors.filled.count - (stuck.sum() - 1)) <= 1
+    assert f"{stuck.sum() - 1} IMU rows" in offline.sentence
+    assert "imu.filled" in {get_key(note) for note in online.notes}
+    assert not online.failures
+    t = np.concatenate([track.t for track in online.settled()])
+    assert not ((t > 70.5) & (t < 94.5)).any()
+    assert t[-1] == pytest.approx(recording.end)
 
 
 @pytest.mark.parametrize(("unit", "key"), [("g", "imu.force_scale"), ("deg/s", "imu.gyro_unit")])

@@ -33,6 +33,18 @@ def test_no_right_fix_is_left_out_that_the_noise_model_was_estimated_from() -> N
     assert online.excluded == ()
 
 
+def test_what_fills_a_gap_of_the_imu_is_not_taken_for_a_fault_of_the_fixes_behind_it() -> None:
+    """The noise model of the first seconds, and a gap of a second and a half behind them."""
+    recording = load("kitti").crop(171.4, 218.4).without("gnss", (40.0, 60.0))
+    online, left_out = Online(drop_rows(recording)), set()
+    for row in list_rows(recording)[1]:
+        online.add(row)
+        left_out |= {span for span in online.excluded if span.count > 1}
+    assert online.tracker is not None
+    assert online.tracker.noise.figures
+    assert not left_out
+
+
 def play(recording: Recording) -> Online:
     """Without another estimate of the noise model than that from the rows of the alignment."""
     online = Online(drop_rows(recording), parse_settings({"gnss": {"velocity": False}, "solver": {"lag": 60.0}}))

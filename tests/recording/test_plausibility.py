@@ -119,6 +119,18 @@ def test_nothing_is_said_of_what_comes_with_the_program(name: str) -> None:
     assert same(replace(recording, imu=take_rows(recording.imu, left)), screen(recording).recording)
 
 
+@pytest.mark.parametrize("share", [0.05, 0.4])
+def test_a_sensor_that_is_stuck_is_found_however_much_of_a_recording_it_is(tokyo: Recording, share: float) -> None:
+    imu = tokyo.imu
+    stuck = slice(n := len(imu.t) // 2, n + round(share * len(imu.t)))
+    gyro, accel = imu.gyro.copy(), imu.accel.copy()
+    gyro[stuck], accel[stuck] = gyro[n], accel[n]
+    left = screen(replace(tokyo, imu=replace(imu, gyro=gyro, accel=accel)))
+    assert "imu.filled" in {f.key for f in left.findings}
+    assert not np.isin(imu.t[n + 1 : stuck.stop], left.recording.imu.t).any()
+    assert np.isin(np.delete(imu.t, stuck), left.recording.imu.t).all()
+
+
 def test_nothing_is_said_of_a_walk(shared_data: Path) -> None:
     folders = ("gcp_walks", "openshoe_loops", "pyshoe_vicon", "xio_loops")
     walks = [f for folder in folders for f in (shared_data / folder).glob("*.toml")]

@@ -55,7 +55,6 @@ from graphnav.estimation.solvers.stages import (
     Message,
     Place,
     append_columns,
-    count_columns,
     group_runs,
 )
 
@@ -194,16 +193,13 @@ class Tree:
             if not own_steps:
                 continue
             columns = append_columns({}, own_steps)
-            node = self._add_variable(
-                np.zeros(count_columns(columns) - DIM), np.ones(count_columns(columns) - DIM), place.t
-            )
+            unit = [self._first_sigma.setdefault(s.name, np.asarray(s.sigma, dtype=float)) for s in own_steps]
+            mean, sigma = (np.concatenate([getattr(s, name) for s in own_steps]) for name in ("mean", "sigma"))
+            node = self._add_variable(mean, np.concatenate(unit), place.t)
             node.limit = find_node_limits(columns, place)
-            own_A, old_A = np.zeros((len(node.unit), len(node.unit))), dict[int, tuple[Variable, Array]]()
+            own_A, old_A = np.diag(1.0 / sigma), dict[int, tuple[Variable, Array]]()
             for step in own_steps:
                 at = shift(columns[step.name])
-                node.unit[at] = self._first_sigma.setdefault(step.name, np.asarray(step.sigma, dtype=float))
-                node.anchor[at] = step.mean
-                own_A[at, at] = np.diag(1.0 / step.sigma)
                 if step.name in self._in_force and step.decay:
                     old, was = self._in_force[step.name]
                     node.anchor[at] = step.predict(old.anchor[was])

@@ -18,7 +18,7 @@ import numpy as np
 
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
-from graphnav.core.state import States
+from graphnav.core.state import DIM, States
 from graphnav.estimation.factor_graph.tree import Tree
 from graphnav.estimation.factor_graph.tree_marginals import (
     Elimination,
@@ -59,6 +59,7 @@ class TreeWindow(Window):
         self._whole, self._look = whole, _LEAST
         self.tree = Tree(prior, turn, whole)
         self._leaving: Elimination | None = None  # of stages that are to leave
+        self._points: Sequence[Array] = ()  # where `revise` linearises first, error states of the stages
 
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
         """As of `Window`; the newest message is about the tree's estimate."""
@@ -98,6 +99,10 @@ class TreeWindow(Window):
         moved = self.tree.find_moves() > share
         return int(np.argmax(moved)) - self.tree.held if moved.any() else None
 
+    def linearise_at(self, means: Sequence[Array]) -> None:
+        """As of `Window`."""
+        self._points = means
+
     def revise(self, count: int, renewed: Renewing | None, always: bool = False, share: float = 1.0) -> bool:
         """As of `Window`, but all at once; False, as nothing is left to do."""
 
@@ -108,6 +113,9 @@ class TreeWindow(Window):
             return places
 
         again = None if renewed is None else renew_at_once
+        for keyframe, stage, e in zip(self.tree.keyframes[self.tree.held :], self.stages, self._points, strict=False):
+            keyframe.put(stage.message.state.plus(e[None, :DIM]), stage.message.values + e[DIM:])
+        always, self._points = always or bool(len(self._points)), ()
         if always and self.stages:
             self.tree.linearise_again(range(self.tree.held, len(self.tree)), again)
             self._relinearise_keyframes(len(self))

@@ -81,10 +81,15 @@ def _share_nodes(constraints: list[Constraint]) -> tuple[Constraint, ...]:
             some = [p for p in rows.parameters if p.begins is None and not p.constant]
             least = min((closest.get(p.name, p.spacing) for p in some), default=np.inf)
             closest |= {p.name: least for p in some}
-    return tuple(
-        replace(c, parameters=tuple(replace(p, spacing=closest.get(p.name, p.spacing)) for p in c.parameters))
-        for c in constraints
-    )
+
+    def share(rows: Constraint) -> Constraint:
+        if all(closest.get(p.name, p.spacing) == p.spacing for p in rows.parameters):
+            return rows  # as the rows of a keyframe mostly are, of which a copy takes as long as all else here
+        return replace(
+            rows, parameters=tuple(replace(p, spacing=closest.get(p.name, p.spacing)) for p in rows.parameters)
+        )
+
+    return tuple(share(rows) for rows in constraints)
 
 
 def _scale_rows(problem: Problem, rows: Constraint, noise: NoiseModel) -> Constraint:

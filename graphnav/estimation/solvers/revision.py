@@ -34,16 +34,24 @@ Renewing = Callable[[int, int], Sequence[Place] | None]  # None where it wants t
 
 
 class Revision:
-    """The stages of a window from `first` on."""
+    """The stages of a window from `first` on.
 
-    def __init__(self, window: Window, first: int) -> None:
-        self.window, self.first = window, first
-        e = window.compute_means()[first]
+    Parameters
+    ----------
+    means : where they are to be linearised, error states as of `Window.compute_means`, which has the smoothed ones.
+    """
+
+    def __init__(self, window: Window, first: int, means: Sequence[Array] | None = None) -> None:
+        self.window, self.first, self._means = window, first, means
+        e = self._list_means()[first]
         self._was = window.stages[first - 1] if first else None
         self._stage = None if self._was is None else self._was.move(e)  # the one before, where it is in the window
         self._before = window.head.move(e) if self._stage is None else self._stage.message
         self._old: list[Stage] = []
         self.made: list[Stage] = []  # their replacements
+
+    def _list_means(self) -> Sequence[Array]:
+        return self.window.compute_means() if self._means is None else self._means
 
     def step(self, count: int, renewed: Renewing | None) -> bool:
         """Rebuild at most so many stages; True once they are in place, or no longer wanted.
@@ -64,7 +72,7 @@ class Revision:
             places = [stage.place for stage in old] if renewed is None else renewed(begin, end)
             if places is None:
                 return False
-            made += self._smooth_again(old, window.compute_means()[begin + 1 : end + 1], places)
+            made += self._smooth_again(old, self._list_means()[begin + 1 : end + 1], places)
             self._old += old
         if end < len(window):
             return False

@@ -126,6 +126,8 @@ class Measured:
 
     def settle(self, y: Array) -> Measured:
         """The same with the kernel's weights for the error state y (D,) for good."""
+        if self.kernel == "none":
+            return self
         H, b, sigma = self.weigh(y, 1)
         return replace(self, H=H, b=b, sigma=sigma, kernel="none")
 

@@ -30,7 +30,7 @@ from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.schema import FORCE
 from graphnav.recording.plausibility import fixes as plausibility_gnss
 from graphnav.recording.plausibility import odometer as plausibility_odometer
-from graphnav.recording.plausibility.filled import find_filled
+from graphnav.recording.plausibility.filled import describe_filled, find_filled
 from graphnav.recording.plausibility.readings import NOISY, find_contradicted
 
 # Limits of readings: no accelerometer for vehicles or feet has a range beyond 100 g (those for crash tests have 200 g
@@ -294,14 +294,8 @@ def drop_filled(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
         return imu, []
     runs = find_runs(filled)
     longest, first = max((float(imu.t[b - 1] - imu.t[a]), float(imu.t[a])) for a, b in runs)
-    return take_rows(imu, ~filled), [
-        Finding(
-            "warning",
-            f"{_list_rows(filled)} in {format_count(len(runs), 'stretch', 'stretches')} lie on straight lines or "
-            f"repeat one row (the longest, of {longest:.2f} s, at {first - start:.1f} s): not measured",
-            "imu.filled",
-        )
-    ]
+    where = f"{first - start:.1f} s"
+    return take_rows(imu, ~filled), [describe_filled(int(filled.sum()), len(runs), longest, where)]
 
 
 def drop_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, list[Finding]]:
