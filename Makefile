@@ -11,8 +11,9 @@ export OPENBLAS_NUM_THREADS := 1
 # bytecode as well is kept: every program that the tests start would compile its imports again
 unexport PYTHONDONTWRITEBYTECODE
 
-# uv installs in a fifth of the time, where it can be had
-install = ($(BIN)/pip install --quiet uv && $(BIN)/uv pip install --quiet --python $(BIN)/python -e '.[$(EXTRAS)]') || \
+# uv installs in a fifth of the time, where it can be had and finds the packages
+install = ($(BIN)/pip install --quiet uv && \
+	$(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python -e '.[$(EXTRAS)]') 2>/dev/null || \
 	$(BIN)/pip install --quiet -e '.[$(EXTRAS)]'
 
 # machine code of the filter and the smoother, kept on disk
