@@ -31,7 +31,8 @@ from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.left_out import compute_excluded_share
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, VarianceComponent
+from graphnav.estimation.noise.priors import get_prior
 from graphnav.estimation.noise.scales import are_scales_contradicted
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
@@ -46,6 +47,7 @@ class JointEstimate:
     freed: Freed
     estimate: NoiseEstimate
     tested: NoiseModel | None = None  # with which the constants were tested last, and stayed as they are
+    rival: JointEstimate | None = None  # less likely with all measurements, from the initial figures as stated
 
     @property
     def base(self) -> Problem:
@@ -120,42 +122,57 @@ def begin_jointly(
     def go_on(base: Problem, before: JointEstimate) -> NoiseEstimate:
         return estimate(base, before, before.estimate.noise)
 
+    def free_in(one: NoiseEstimate) -> JointEstimate:
+        return _free_constants(JointEstimate(stated, {}, one), settings, go_on, estimate)
+
     first = estimate_noise(stated, opening, start, progress=progress, changed=True)
-    found = JointEstimate(stated, {}, _compare_with_worse_imu(stated, first, opening, progress))
-    return _free_constants(found, settings, go_on, estimate)
+    other = _estimate_with_worse_imu(stated, first, opening, progress)
+    if other is None:
+        return free_in(first)
+    if other.log_evidence <= first.log_evidence + first.gained_by_chance:
+        return free_in(replace(first, passes=first.passes + other.passes))
+    return replace(free_in(other), rival=free_in(first))
 
 
-def _compare_with_worse_imu(
+def _estimate_with_worse_imu(
     stated: Problem, found: NoiseEstimate, opening: float | None, progress: Progress | None
-) -> NoiseEstimate:
-    """An estimate, or, where by it an aiding sensor is worse than its prior's sigma, one that begins with the IMU as
-    many sigmas worse instead, if that is likelier by more than chance.
+) -> NoiseEstimate | None:
+    """Where by an estimate an aiding sensor is worse than its prior's sigma, one that begins with the IMU as many
+    sigmas worse instead.
 
     A bias walk that is small beside all other noise changes nothing, so that no step leads from there to an optimum at
     which it explains everything.
     """
     figures = found.noise.figures
-    of_imu = {name for name in figures if name.startswith("imu.")}
-    most = max(
-        ((x.log_factor - x.prior) / x.prior_sigma for name, x in figures.items() if name not in of_imu), default=0.0
-    )
+    aiding = [x for name, x in figures.items() if not name.startswith("imu.")]
+    most = max(((x.log_factor - x.prior) / x.prior_sigma for x in aiding), default=0.0)
     if most <= 1.0:
-        return found
-    worse = {
-        name: replace(x, log_factor=x.prior + (name in of_imu) * most * x.prior_sigma) for name, x in figures.items()
-    }
+        return None
+    worse = {}
+    for name in figures:
+        median, sigma = get_prior(name)
+        worse[name] = VarianceComponent(median + name.startswith("imu.") * most * sigma)
     with contextlib.suppress(*BREAKDOWN):
-        other = estimate_noise(stated, opening, NoiseModel(worse), progress=progress, changed=True)
-        likelier = other.log_evidence > found.log_evidence + found.gained_by_chance
-        return replace(other if likelier else found, passes=found.passes + other.passes)
-    return found
+        near = found.get_linearisation(stated)
+        return estimate_noise(stated, opening, NoiseModel(worse), near, progress, changed=True)
+    return None
 
 
 def leave_out_jointly(
     found: JointEstimate, settings: GnssSettings, opening: float | None = None, progress: Progress | None = None
 ) -> JointEstimate:
-    """The same without spans of wrong measurements; what is given is as for `estimate_jointly`."""
-    return replace(found, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress))
+    """The same without spans of wrong measurements; what is given is as for `estimate_jointly`.
+
+    With these among the measurements, an IMU that is worse may be the likelier explanation, so rivals are compared now.
+    """
+    best = replace(
+        found, rival=None, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress)
+    )
+    if found.rival is None:
+        return best
+    best, plain = best.weigh(), leave_out_jointly(found.rival, settings, opening, progress).weigh()
+    likelier = best.compute_evidence() > plain.compute_evidence() + plain.estimate.gained_by_chance
+    return (best if likelier else plain).count(best.estimate.passes + plain.estimate.passes)
 
 
 def revise_jointly(
