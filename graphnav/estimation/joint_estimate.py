@@ -144,7 +144,7 @@ def _estimate_with_worse_imu(
     which it explains everything.
     """
     figures = found.noise.figures
-    aiding = [x for name, x in figures.items() if not name.startswith("imu.")]
+    aiding = [x for name, x in figures.items() if not name.startswith(("imu.", "prior."))]  # of offsets, no noise
     most = max(((x.log_factor - x.prior) / x.prior_sigma for x in aiding), default=0.0)
     if most <= 1.0:
         return None
