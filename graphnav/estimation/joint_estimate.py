@@ -153,8 +153,7 @@ def _estimate_with_worse_imu(
         median, sigma = get_prior(name)
         worse[name] = VarianceComponent(median + name.startswith("imu.") * most * sigma)
     with contextlib.suppress(*BREAKDOWN):
-        near = found.get_linearisation(stated)
-        return estimate_noise(stated, opening, NoiseModel(worse), near, progress, changed=True)
+        return estimate_noise(stated, opening, NoiseModel(worse), progress=progress, changed=True)
     return None
 
 

@@ -147,9 +147,9 @@ def _iterate(
     """Iterate from initial figures and linearisation points to convergence."""
     done, total, converged = 0, len(problem.t), False  # keyframes
     long = total > 2 * _FIRST_KEYFRAMES and not figures.known
-    rounds = _AGAIN if figures.same_data else _ROUNDS
     latest: tuple[ForwardRecord, MomentPass] | None = None
     for end in (_FIRST_KEYFRAMES, total) if long else (total,):
+        rounds = _AGAIN if figures.same_data or done else _ROUNDS
         before, converged, figures.extrapolation = -np.inf, False, 1.0
         here, likeliest, most, since = figures, figures, -np.inf, 0
         for k in range(_MAX_PASSES):
