@@ -136,7 +136,7 @@ def _read_sp3(path: Path, remarks: list[str]) -> tuple[Array, Ids, Array, Array]
     own = np.flatnonzero(first == ord("P"))
     if not len(epoch) or not len(own):
         raise RecordingError(f"{path}: holds no positions", key="raw.no_positions")
-    t = _read_stamps(lines, epoch, 3, scale, path)
+    t = _read_stamps(lines, epoch, scale, path)
     try:
         value = parse_numbers(lines.take_block(own, 4, 60), 14)
         names = [bytes(x).decode() for x in lines.take_block(own, 1, 4)]
@@ -198,9 +198,9 @@ def _find_id(name: str) -> int:
     return number_satellite(name if name[0] != " " else "G" + name[1:])
 
 
-def _read_stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path: Path) -> Array:
-    """(n,) s since the GPS epoch, from lines with a date at a given column."""
-    words = [lines.get_text(k)[begin:].split()[:6] for k in which]
+def _read_stamps(lines: Lines, which: NDArray[np.intp], scale: str, path: Path) -> Array:
+    """(n,) s since the GPS epoch, from lines of a sign, a space and a date."""
+    words = [lines.get_text(k)[3:].split()[:6] for k in which]
     try:
         return _read_dates(np.array(words, dtype=float), scale)
     except ValueError:

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.ephemeris import Ephemerides, Glonass, Kepler
 from graphnav.gnss.files import count_days, note_cut, unpack_bytes
@@ -46,7 +46,7 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
         If one is no RINEX navigation file, or none of them holds an ephemeris.
     """
     found = _Navigation()
-    remarks: list[str] = []
+    remarks = Notes()
     for path in paths:
         found.broken, found.skipped = [], {}
         remarks += _read(path, found)
@@ -54,10 +54,10 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
             sentence = (
                 f"{format_count(len(found.broken), 'unreadable record')} left out (the first at line {found.broken[0]})"
             )
-            remarks.append(Note("raw.broken_records", f"{path.name}: {sentence}"))
+            remarks.add("raw.broken_records", f"{path.name}: {sentence}")
         if found.skipped:
             names = ", ".join(f"{n} {name}" for name, n in sorted(found.skipped.items()))
-            remarks.append(Note("raw.unused_messages", f"{path.name}: messages that are not used: {names}"))
+            remarks.add("raw.unused_messages", f"{path.name}: messages that are not used: {names}")
     if not found.kepler and not found.glonass:
         raise RecordingError(f"{', '.join(str(p) for p in paths)}: no ephemeris in it", key="raw.no_ephemerides")
     coefficients = None
