@@ -19,7 +19,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.sample_size import chi_square_band, chi_square_quantile, count_effective_epochs
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Errors:
     """Estimate minus truth at N common epochs; NaN where either lacks the quantity."""
 
