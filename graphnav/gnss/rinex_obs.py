@@ -18,7 +18,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
 from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import WEEK, utc_to_gps
+from graphnav.core.timescales import GPS_EPOCH, WEEK, count_leap_seconds
 from graphnav.gnss.files import Lines, count_days, find_moved_points, note_cut, parse_numbers, unpack_bytes
 from graphnav.gnss.rinex_header import Header, check_types_stay, read_rinex_header
 from graphnav.gnss.series import Observations, drop_repeated
@@ -163,11 +163,11 @@ def _count_since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tup
     """
     days, good = count_days(fields)
     hour, minute, second = np.where(good[:, None], fields, 0.0).T[3:]
-    since = (days - np.datetime64("1980-01-06", "D")).astype(np.int64)
+    since = (days - GPS_EPOCH.astype("M8[D]")).astype(np.int64)
     week = int(since[used][0]) // 7
     ahead = 0.0
     if scale in ("GLO", "UTC"):
-        ahead = float(utc_to_gps(days[used][:1].astype("datetime64[us]"))[0]) - 86400.0 * float(since[used][0])
+        ahead = float(count_leap_seconds(days[used][:1])[0])
     ahead += 14.0 if scale == "BDT" else 0.0
     return (since - 7 * week) * 86400.0 + hour * 3600.0 + minute * 60.0 + second + ahead, week * WEEK
 

@@ -20,7 +20,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number, read_bytes
 from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import date_week_times, utc_to_gps
+from graphnav.core.timescales import count_leap_seconds, date_week_times, utc_to_gps
 from graphnav.recording import Gnss, convert_fix_types
 from graphnav.recording.formats import novatel, ubx
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
@@ -238,9 +238,9 @@ def _date_fixes(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Notes) -> tu
         )
         return of_day, None
     midnight = np.datetime64(dated.date, "us") - np.timedelta64(days[dated.line], "D")
-    gps = utc_to_gps(midnight + (of_day * 1e6).round().astype("timedelta64[us]"))
-    t, zero = date_week_times(gps)
-    ahead = round(float(gps[0] - (midnight - np.datetime64("1980-01-06", "us")) / np.timedelta64(1, "s") - of_day[0]))
+    utc = midnight + (of_day * 1e6).round().astype("timedelta64[us]")
+    t, zero = date_week_times(utc_to_gps(utc))
+    ahead = int(count_leap_seconds(utc)[0])
     remarks.add(
         "log.clock",
         f"clock: UTC turned into GPS time ({ahead} leap seconds in {dated.date.year}), seconds of the GPS week",

@@ -17,10 +17,9 @@ from graphnav.core.earth import LocalFrame, ecef_to_llh, enu_axes
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Notes
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import GPS_TO_UNIX, WEEK, date_week_times, unix_to_gps
+from graphnav.core.timescales import GPS_EPOCH, GPS_TO_UNIX, WEEK, date_week_times, unix_to_gps
 from graphnav.recording.formats.text import NumberedLines, parse_table
 
-_GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 _ZONES = {"UTC": 0.0, "JST": 9 * 3600.0}  # s ahead of UTC
 _NUMBER = r"[-+]?\d+(?:\.\d*)?"
 # the columns of a position, the letters of its axes in those of sigmas, and the order of east, north, up in them
@@ -188,4 +187,4 @@ def _parse_dates(path: Path, rows: NumberedLines, separator: str | None) -> tupl
                     f"{path}, line {number}: '{stamp.replace('T', ' ')[:60]}' is not a date and time", key="table.date"
                 ) from None
         raise
-    return (when - _GPS_EPOCH) / np.timedelta64(1, "us") * 1e-6, rest
+    return (when - GPS_EPOCH) / np.timedelta64(1, "us") * 1e-6, rest
