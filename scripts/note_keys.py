@@ -39,7 +39,7 @@ def _text(node: ast.expr) -> str | None:
 def _key(call: ast.Call) -> str | None:
     """The key that a call gives to a note or a finding."""
     name = call.func.id if isinstance(call.func, ast.Name) else getattr(call.func, "attr", "")
-    if name == "Note" or (name == "add" and ast.unparse(call.func).endswith("remarks.add")):
+    if name == "Note" or (name == "add" and ast.unparse(call.func).endswith(("notes.add", "remarks.add"))):
         return _text(call.args[0])
     if name == "Finding" and len(call.args) > 2:
         return _text(call.args[2])

@@ -24,6 +24,7 @@ from scipy.interpolate import PchipInterpolator, make_interp_spline
 from graphnav.config import parse_settings
 from graphnav.core import earth, rotation
 from graphnav.core.earth import LocalFrame
+from graphnav.core.interpolation import pick_nearest
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
 from graphnav.gnss.load import Sources, load_raw
@@ -165,8 +166,7 @@ def recording_of(data: Path, folder: Path, with_base: bool = True) -> tuple[Reco
 def errors(t: Array, llh: Array, at: Array, places: Array) -> Array:
     """(N, 3) east, north, up (m) of positions at the truth's epochs."""
     r = earth.llh_to_ecef(llh)
-    k = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
-    k = np.where(np.abs(t[k - 1] - at) < np.abs(t[k] - at), k - 1, k)
+    k = pick_nearest(t, at)
     good = np.abs(t[k] - at) < 2e-3
     R = earth.enu_axes(earth.ecef_to_llh(places))
     out = np.einsum("nij,nj->ni", R, r[k] - places)

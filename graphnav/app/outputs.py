@@ -292,16 +292,16 @@ def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) 
 
 
 def _list_calibration(p: ParameterEstimate) -> dict[str, Any]:
-    """A constant as its value, a time-varying parameter as its nodes."""
-    nodes = slice(None) if len(p.t) > 1 else 0
-    return {
-        "unit": p.unit,
-        **({"t": p.t} if len(p.t) > 1 else {}),
-        "value": p.value[nodes],
-        "sigma": p.sigma[nodes],
-        "prior_sigma": p.prior_sigma,
-        "seen_by_the_data": p.observable,
-    }
+    """A constant as its value, a time-varying parameter as its nodes, with the digits of trajectory.csv."""
+    from graphnav.recording.exporters.digits import format_json_rows
+
+    nodes: dict[str, Any] = {"value": p.value[0], "sigma": p.sigma[0]}
+    if len(p.t) > 1 and np.isfinite(p.value).all() and np.isfinite(p.sigma).all():
+        nodes = {"t": partial(format_json_rows, p.t, "%.6f")}
+        nodes |= {key: partial(format_json_rows, x, "%.6g") for key, x in (("value", p.value), ("sigma", p.sigma))}
+    elif len(p.t) > 1:
+        nodes = {"t": p.t, "value": p.value, "sigma": p.sigma}
+    return {"unit": p.unit, **nodes, "prior_sigma": p.prior_sigma, "seen_by_the_data": p.observable}
 
 
 def _list_findings(outcome: Outcome) -> list[str]:

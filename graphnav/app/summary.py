@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import platform
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -19,6 +18,7 @@ from graphnav.core.notes import get_key
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.stops import list_solution_stops
 from graphnav.evaluation.against import find_antenna_lever_arm, select_own
+from graphnav.evaluation.metrics import round_figure
 
 if TYPE_CHECKING:
     from graphnav.estimation.noise.table import FigureRow
@@ -132,9 +132,13 @@ def tabulate_comparison(outcome: Outcome, ours: bool = False) -> list[dict[str, 
     rows = []
     for name, solution in (select_own(outcome.solutions) if ours else outcome.solutions).items():
         row = measured.get(name, {"solver": name})
-        row |= {key: _round(value) for key, value in compute_median_sigmas(solution).items()}
-        row |= {"keyframes": len(solution.t), "iterations": solution.iterations, "final_cost": _round(solution.cost)}
-        row["run_time_s"] = _round(sum(solution.timings.values()))
+        row |= {key: round_figure(value) for key, value in compute_median_sigmas(solution).items()}
+        row |= {
+            "keyframes": len(solution.t),
+            "iterations": solution.iterations,
+            "final_cost": round_figure(solution.cost),
+        }
+        row["run_time_s"] = round_figure(sum(solution.timings.values()))
         for key in [k for k in row if k.startswith("span") and k.endswith(("_start_s", "_end_s"))]:
             row[key] = round(row[key] + outcome.zero, 6)
         rows.append(row)
@@ -170,7 +174,3 @@ def gather_provenance(outcome: Outcome) -> dict[str, Any]:
         "inputs": {str(path): hash_file(path) for path in files},
         "options": dict(outcome.request.options),
     }
-
-
-def _round(x: float) -> float | None:
-    return float(f"{x:.5g}") if math.isfinite(x) else None

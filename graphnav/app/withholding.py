@@ -9,7 +9,7 @@ import numpy as np
 from graphnav.app.scores import Withheld
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Notes
 from graphnav.recording import Recording, list_sources
 
 
@@ -56,7 +56,7 @@ def shift_spans(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ..
 def withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float) -> tuple[Recording, list[str]]:
     """The recording without what is withheld (s from its start), and notes where that changed nothing."""
     used = recording
-    notes: list[str] = []
+    notes = Notes()
     for source, span in withheld:
         name = source if span is None else f"{source}:{span[0] + zero:g}-{span[1] + zero:g}"
         if span is not None and (span[1] <= 0.0 or span[0] >= recording.duration):
@@ -70,5 +70,5 @@ def withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float) 
         before = used
         used = used.without(source, span)
         if span is not None and len(used.aiding[source].t) == len(before.aiding[source].t):
-            notes.append(Note("withheld.nothing", f"--without {name}: there was no {source} row in that span anyway"))
+            notes.add("withheld.nothing", f"--without {name}: there was no {source} row in that span anyway")
     return used, notes

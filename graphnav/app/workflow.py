@@ -24,8 +24,9 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.beside import Later, begin_beside
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.memory import return_memory
-from graphnav.core.notes import Note, format_count, get_key
+from graphnav.core.notes import Note, Notes, format_count, get_key
 from graphnav.core.progress import Progress, send_progress, tell
 from graphnav.estimation.names import name_rows
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, StampOffsets
@@ -286,33 +287,27 @@ def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
     """Notes on the parts of a noise model that concern measurements which a solution does not have."""
     have = dict.fromkeys(INTERVALS, solution.t) | {name: record.t for name, record in solution.records.items()}
     named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
-    notes: list[str] = [
-        Note("noise.file.unused", f"noise model: figures of {name_rows(name)}, which are not used for this recording")
-        for name in sorted(named - set(have))
-    ]
+    notes = Notes()
+    for name in sorted(named - set(have)):
+        figures = f"figures of {name_rows(name)}, which are not used for this recording"
+        notes.add("noise.file.unused", f"noise model: {figures}")
     for name, some in noise.weights.items():
         if name in have and len(some.t):
             t = have[name]
-            k = np.clip(np.searchsorted(t, some.t), 1, max(len(t) - 1, 1))
-            near = np.minimum(np.abs(t[k - 1] - some.t), np.abs(t[np.minimum(k, len(t) - 1)] - some.t))
-            lost = int(np.sum(near > SAME_TIME))
+            lost = int(np.sum(np.abs(t[pick_nearest(t, some.t)] - some.t) > SAME_TIME))
             if lost:
-                notes.append(
-                    Note(
-                        "noise.file.rows",
-                        f"noise model: {format_count(lost, 'weight')} of {len(some.t)} for {name_rows(name)} "
-                        "without a row in this recording",
-                    )
+                notes.add(
+                    "noise.file.rows",
+                    f"noise model: {format_count(lost, 'weight')} of {len(some.t)} for {name_rows(name)} "
+                    "without a row in this recording",
                 )
     for name, spans in noise.excluded.items():
         lost = sum(not np.any((have[name] >= a) & (have[name] <= b)) for a, b in spans) if name in have else 0
         if lost:
-            notes.append(
-                Note(
-                    "noise.file.spans",
-                    f"noise model: {format_count(lost, 'excluded span')} of {len(spans)} of {name_rows(name)} "
-                    "without a row in this recording",
-                )
+            notes.add(
+                "noise.file.spans",
+                f"noise model: {format_count(lost, 'excluded span')} of {len(spans)} of {name_rows(name)} "
+                "without a row in this recording",
             )
     return notes
 

@@ -66,8 +66,8 @@ class BarometricHeight(Constraint):
             return None
         n = count[rows]
         parameters = (
-            Parameter(OFFSET, np.zeros(1), np.full(1, figures.offset_sigma), "m", walk=figures.walk),
-            Parameter(SCALE, np.zeros(1), np.full(1, figures.scale_sigma), "1"),
+            Parameter.centred(OFFSET, 1, figures.offset_sigma, "m", walk=figures.walk),
+            Parameter.centred(SCALE, 1, figures.scale_sigma, "1"),
         )
         return cls(
             keyframe=rows,

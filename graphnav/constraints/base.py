@@ -19,6 +19,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM, Parameter, States
 from graphnav.imu.preintegration import Intervals
@@ -128,13 +129,20 @@ class BuildContext:
         array
             (n,) int, -1 where there is none within a microsecond.
         """
-        right = np.clip(np.searchsorted(self.t, t), 0, len(self.t) - 1)
-        left = np.maximum(right - 1, 0)
-        best = np.where(np.abs(self.t[left] - t) < np.abs(self.t[right] - t), left, right)
+        best = pick_nearest(self.t, t)
         return np.where(np.abs(self.t[best] - t) < SAME_TIME, best, -1)
 
 
 SAME_TIME = 1e-6  # s; measurements closer together than this share a keyframe
+
+
+def keep_apart(t: Array, least: float) -> Array:
+    """The first of times (N,), in order, and each that is `least` s or more after the one before; none needs later."""
+    out = [float(t[0])]
+    for x in t.tolist():
+        if x - out[-1] >= least:
+            out.append(x)
+    return np.array(out)
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ class Baseline(Constraint):
             spacing=find_node_spacing(times, find_fix_period(series.t[used])),
             noise_groups=(f"{cls.name}.{TIMES[1]}.{cls.column}",),
         )  # fmt: skip
-        wrong = Parameter(cls._name_offset(), np.zeros(1), np.full(1, np.radians(figures.baseline_sigma)), "rad")
+        wrong = Parameter.centred(cls._name_offset(), 1, np.radians(figures.baseline_sigma), "rad")
         return cls(
             keyframe=keyframe[used],
             measured=series[cls.column][used, None],

@@ -108,9 +108,9 @@ class Stance(Constraint):
             sigma=np.repeat(sigma[:, None], 3, axis=1),
             parameters=(
                 *make_scale_parameter(scene.recording.imu.noise, scene.recording.platform),
-                Parameter(PIVOT, np.zeros(3), np.full(3, s.pivot_sigma), "m"),
-                Parameter(TRAVEL, np.zeros(2), np.full(2, s.travel_sigma), "m"),
-                *((Parameter(PATTERN, np.zeros(_WIDE), np.full(_WIDE, s.pattern), "m/s"),) if s.pattern else ()),
+                Parameter.centred(PIVOT, 3, s.pivot_sigma, "m"),
+                Parameter.centred(TRAVEL, 2, s.travel_sigma, "m"),
+                *((Parameter.centred(PATTERN, _WIDE, s.pattern, "m/s"),) if s.pattern else ()),
             ),
             **s.outliers,
         )
@@ -183,7 +183,7 @@ class FootLateral(Constraint):
             sigma=sigma[:, None],
             parameters=(
                 *make_scale_parameter(scene.recording.imu.noise, scene.recording.platform),
-                Parameter(FOOT_AXIS, np.zeros(2), np.full(2, np.radians(s.axis_sigma)), "rad"),
+                Parameter.centred(FOOT_AXIS, 2, np.radians(s.axis_sigma), "rad"),
             ),
             **s.outliers,
         )

@@ -88,11 +88,11 @@ def _build_common(scene: BuildContext, offset: str) -> dict[str, Any]:
     if settings.lever_arm_sigma is not None:
         parameters.append(Parameter(LEVER_ARM, gnss.lever_arm, np.full(3, settings.lever_arm_sigma), _UNITS[LEVER_ARM]))
     if settings.time_offset_sigma > 0:
-        sigma = np.full(1, settings.time_offset_sigma)
-        parameters.append(Parameter(offset, np.zeros(1), sigma, "s", noise_groups=(f"prior.{offset}",)))
+        sigma = settings.time_offset_sigma
+        parameters.append(Parameter.centred(offset, 1, sigma, "s", noise_groups=(f"prior.{offset}",)))
         if settings.clock_rate_sigma:
-            sigma = np.full(1, settings.clock_rate_sigma)
-            parameters.append(Parameter(CLOCK_RATE, np.zeros(1), sigma, "s/s", noise_groups=(f"prior.{CLOCK_RATE}",)))
+            sigma, group = settings.clock_rate_sigma, (f"prior.{CLOCK_RATE}",)
+            parameters.append(Parameter.centred(CLOCK_RATE, 1, sigma, "s/s", noise_groups=group))
     return {"parameters": tuple(parameters), "watched": settings.faults != "off", **settings.outliers}
 
 
@@ -328,8 +328,8 @@ class GnssVelocity(_Fixes):
         if not used.any():
             return None
         t = t[used]
-        lasting = Parameter(
-            VELOCITY_ERROR, np.zeros(3), np.ones(3), "sd", correlation_time=SECONDS,
+        lasting = Parameter.centred(
+            VELOCITY_ERROR, 3, 1.0, "sd", correlation_time=SECONDS,
             spacing=find_node_spacing((), find_fix_period(t)),
             noise_groups=tuple(f"{cls.name}.seconds.{axis}" for axis in cls.noise_axes),
         )  # fmt: skip

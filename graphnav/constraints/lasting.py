@@ -67,8 +67,8 @@ def make_multipath(t: Array, size: Array, spacing: float) -> Parameter:
 
 
 def _make_process(error: str, lasts: float, spacing: float, kind: str = "") -> Parameter:
-    return Parameter(
-        f"gnss_error_of_{error}{kind.replace('.', '_')}", np.zeros(3), np.ones(3), "sd",
+    return Parameter.centred(
+        f"gnss_error_of_{error}{kind.replace('.', '_')}", 3, 1.0, "sd",
         correlation_time=lasts, spacing=spacing,
         noise_groups=tuple(f"{_ROWS}{kind}.{error}.{axis}" for axis in _AXES),
     )  # fmt: skip

@@ -77,9 +77,9 @@ class OdometerSpeed(Wheels):
             return None
         lever_arm, parameters = make_wheel_parameters(scene)
         walk = s.scale_walk / np.sqrt(60.0)
-        parameters.append(Parameter(ODOMETER_SCALE, np.zeros(1), np.full(1, odometer.scale_sigma), "1", walk=walk))
+        parameters.append(Parameter.centred(ODOMETER_SCALE, 1, odometer.scale_sigma, "1", walk=walk))
         if odometer.delay_sigma > 0:
-            parameters.append(Parameter(ODOMETER_DELAY, np.zeros(1), np.full(1, odometer.delay_sigma), "s"))
+            parameters.append(Parameter.centred(ODOMETER_DELAY, 1, odometer.delay_sigma, "s"))
         density = np.atleast_1d(
             np.hypot(s.odometer_density, np.median(speed.compute_sigma(begin, end) * np.sqrt(end - begin)))
         )

@@ -217,9 +217,7 @@ class GnssCarrier(SatelliteConstraint):
         common["parameters"] = (
             Parameter(CHANGE, pairs.clock[:, None], np.full((E, 1), _CHANGE_SIGMA), "m", begins=pairs.epochs),
             # a Gauss-Markov error changes by about its sigma within its correlation time
-            Parameter(
-                RATES, np.zeros(many), np.full(many, ONE / hours), "m/s", correlation_time=hours, spacing=found.spacing
-            ),
+            Parameter.centred(RATES, many, ONE / hours, "m/s", correlation_time=hours, spacing=found.spacing),
             make_ionosphere_parameter(raw, found.spacing),
             *_clone_antennas(found, pairs),
         )

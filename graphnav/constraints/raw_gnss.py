@@ -82,19 +82,11 @@ def list_common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, An
     settings, raw = scene.settings, found.raw
     parameters: tuple[Parameter, ...] = (found.clock,)
     if settings.gnss.lever_arm_sigma is not None:
-        parameters += (
-            Parameter(
-                LEVER_ARM,
-                raw.lever_arm,
-                np.full(3, settings.gnss.lever_arm_sigma),
-                "m",
-                _LEVER_WALK,
-                spacing=found.spacing,
-            ),
-        )
+        sigma = np.full(3, settings.gnss.lever_arm_sigma)
+        parameters += (Parameter(LEVER_ARM, raw.lever_arm, sigma, "m", _LEVER_WALK, spacing=found.spacing),)
     if raw.differenced:
-        size = np.full(1, _PHASE_CENTRES)
-        parameters += (Parameter(PHASE_CENTRES, np.zeros(1), size, "m", _CENTRES_WALK, spacing=found.spacing),)
+        centres = Parameter.centred(PHASE_CENTRES, 1, _PHASE_CENTRES, "m", _CENTRES_WALK, spacing=found.spacing)
+        parameters += (centres,)
     return {
         "keyframe": found.keyframe,
         "s_n": found.s_n,
@@ -112,7 +104,7 @@ def list_common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, An
 def make_ionosphere_parameter(raw: RawGnss, spacing: float) -> Parameter:
     """Zenith error of the ionosphere model; against a base station, its difference between the two."""
     sigma = max(_GRADIENT * raw.baseline, 1e-3) if raw.differenced else _ZENITH
-    return Parameter(IONOSPHERE, np.zeros(1), np.full(1, sigma), "m", sigma / _ZENITH * _ZENITH_WALK, spacing=spacing)
+    return Parameter.centred(IONOSPHERE, 1, sigma, "m", sigma / _ZENITH * _ZENITH_WALK, spacing=spacing)
 
 
 def _tell_gross(count: int) -> tuple[Note, ...]:
@@ -237,20 +229,10 @@ class GnssCode(RangeConstraint):
         groups, group = group_signals(raw)
         common, spacing = list_common_fields(scene, found), found.spacing
         less = _DIFFERENCED if raw.differenced else 1.0
-        more: tuple[Parameter, ...] = (make_ionosphere_parameter(raw, spacing),)
+        common["parameters"] += (make_ionosphere_parameter(raw, spacing),)
         if len(groups) > 1:
-            size = len(groups) - 1
-            more += (
-                Parameter(
-                    BIASES,
-                    np.zeros(size),
-                    np.full(size, settings.raw_gnss.bias_sigma),
-                    "m",
-                    _BIAS_WALK,
-                    spacing=spacing,
-                ),
-            )
-        common["parameters"] += more
+            size, most = len(groups) - 1, settings.raw_gnss.bias_sigma
+            common["parameters"] += (Parameter.centred(BIASES, size, most, "m", _BIAS_WALK, spacing=spacing),)
         satellites, which = raw.satellites
         minutes, hours = settings.gnss.slow_times
         lasts, lasting = hours, np.full(len(raw), less * ONE)
@@ -260,7 +242,7 @@ class GnssCode(RangeConstraint):
         sigma, many = compute_code_sigma(raw.cn0, found.elevation, delay), len(satellites)
         common["parameters"] += (
             Parameter(CODE_ERRORS[2], np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
-            Parameter(SATELLITES, np.zeros(many), np.ones(many), "1", correlation_time=lasts, spacing=spacing),
+            Parameter.centred(SATELLITES, many, 1.0, "1", correlation_time=lasts, spacing=spacing),
         )
         processes = tuple(
             Parameter(

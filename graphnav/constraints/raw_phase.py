@@ -110,9 +110,7 @@ class GnssPhase(CarrierRows):
         }
         satellites, which = raw.satellites
         many = len(satellites)
-        lasting = Parameter(
-            REFLECTIONS, np.zeros(many), np.ones(many), "1", correlation_time=REFLECTED, spacing=found.spacing
-        )
+        lasting = Parameter.centred(REFLECTIONS, many, 1.0, "1", correlation_time=REFLECTED, spacing=found.spacing)
         common["parameters"] += (make_ionosphere_parameter(found.raw, found.spacing), lasting, *(own[k] for k in there))
         # of two receivers; the mean of a satellite's signals, and their differences from it
         reflection = np.sqrt(2.0) * compute_reflection_sigma(geometry.elevation)

@@ -124,14 +124,10 @@ class _Ppp(RangeConstraint):
         rows, common = free.rows, list_common_fields(scene, free.found)
         at = rows.which[used]
         common |= {name: common[name][at] for name in PER_ROW}
-        common["parameters"] += (
-            Parameter(WET, np.zeros(1), np.full(1, _WET), "m", _WET_WALK, spacing=free.found.spacing),
-        )
+        common["parameters"] += (Parameter.centred(WET, 1, _WET, "m", _WET_WALK, spacing=free.found.spacing),)
         if free.groups > 1:
-            size, sigma = free.groups - 1, scene.settings.raw_gnss.bias_sigma
-            common["parameters"] += (
-                Parameter(BIASES, np.zeros(size), np.full(size, sigma), "m", _BIAS_WALK, spacing=free.found.spacing),
-            )
+            size, sigma, spacing = free.groups - 1, scene.settings.raw_gnss.bias_sigma, free.found.spacing
+            common["parameters"] += (Parameter.centred(BIASES, size, sigma, "m", _BIAS_WALK, spacing=spacing),)
         return common | {
             "nominal": free.found.nominal[at],
             "wet": rows.wet[used],
@@ -150,6 +146,12 @@ class _Ppp(RangeConstraint):
         return residual, J
 
 
+def _make_process(free: FreeRows, name: str, sigma: float, unit: str, time: float) -> Parameter:
+    """A process with this correlation time (s) for each satellite."""
+    spacing = free.found.spacing
+    return Parameter.centred(name, free.satellites, sigma, unit, correlation_time=time, spacing=spacing)
+
+
 @dataclass(frozen=True)
 class GnssPppCode(_Ppp):
     """Ionosphere-free code of one satellite at the antenna."""
@@ -164,13 +166,8 @@ class GnssPppCode(_Ppp):
             return None
         rows, raw = free.rows, free.found.raw.take(free.rows.which)
         common = cls._collect_shared_fields(scene, free, np.arange(len(rows.which)))
-        size, hours = free.satellites, scene.settings.gnss.slow_times[1]
-        common["parameters"] += (
-            Parameter(
-                SATELLITES, np.zeros(size), np.full(size, _CODE_BIAS), "m", correlation_time=hours,
-                spacing=free.found.spacing,
-            ),
-        )  # fmt: skip
+        hours = scene.settings.gnss.slow_times[1]
+        common["parameters"] += (_make_process(free, SATELLITES, _CODE_BIAS, "m", hours),)
         sigma = rows.growth * compute_code_sigma(raw.cn0, rows.geometry.elevation, np.zeros(len(raw)))
         return cls(offset=rows.known - rows.code, sigma=sigma[:, None], **common)
 
@@ -206,17 +203,10 @@ class GnssPppCarrier(CarrierRows, _Ppp):
         common = cls._collect_shared_fields(scene, free, used)
         own = make_ambiguities(arcs, rows.carrier - rows.code, np.ones(len(arcs.arc)), "m")
         there = sorted(own)
-        common["parameters"] += tuple(own[k] for k in there)
-        size, hours = free.satellites, scene.settings.gnss.slow_times[1]
         common["parameters"] += (
-            Parameter(
-                ORBITS, np.zeros(size), np.full(size, _ORBIT), "m", correlation_time=hours, spacing=free.found.spacing
-            ),
-        )
-        common["parameters"] += (
-            Parameter(
-                CARRIER_SLOW, np.zeros(size), np.ones(size), "1", correlation_time=REFLECTED, spacing=free.found.spacing
-            ),
+            *(own[k] for k in there),
+            _make_process(free, ORBITS, _ORBIT, "m", scene.settings.gnss.slow_times[1]),
+            _make_process(free, CARRIER_SLOW, 1.0, "1", REFLECTED),
         )
         noise = raw.clock_noise
         middle, apart = np.array([noise.get(s, (0.0, 1.0)) for s in raw.satellite.tolist()]).T

@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
-from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.base import SAME_TIME, keep_apart
 from graphnav.core.errors import ConfigError
-from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss, choose_primary
 from graphnav.gnss.single_point import choose_coefficients, look
 from graphnav.recording import Recording
@@ -26,7 +25,7 @@ def select_observations(recording: Recording, settings: Settings) -> RawGnss | N
     if raw.catalogue is None:  # a piece of a series also holds the previous epoch, for carrier-phase changes
         used &= (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME)
     if s.period > 0.0 and used.any():
-        used &= np.isin(raw.t, _thin_times(np.unique(raw.t[used]), s.period))
+        used &= np.isin(raw.t, keep_apart(np.unique(raw.t[used]), s.period - EARLY))
     raw = raw.take(used)
     raw = raw.take(choose_primary(raw))
     return raw if len(raw) else None
@@ -60,12 +59,3 @@ def select_usable(raw: RawGnss, settings: RawGnssSettings) -> NDArray[np.bool_]:
     """(N,) mask of rows with a satellite position, strong enough and, with a base station, observed by it."""
     used = np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock) & ~(raw.cn0 < settings.cn0)
     return used & np.isfinite(raw.difference) if raw.differenced else used
-
-
-def _thin_times(t: Array, least: float) -> Array:
-    """Select times that are at least `least` s apart."""
-    out = [float(t[0])]
-    for x in t.tolist():
-        if x - out[-1] >= least - EARLY:
-            out.append(x)
-    return np.array(out)

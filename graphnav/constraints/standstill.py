@@ -29,6 +29,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core import rotation
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.rotation import Array, mv
 from graphnav.core.running import run_maximum
 from graphnav.core.state import Parameter, States
@@ -232,7 +233,6 @@ def _guess_places(scene: BuildContext, stops: Array) -> Parameter:
     else:
         p = scene.frame.from_llh(gnss.llh)
         place = np.stack([np.interp(begins, gnss.t, axis) for axis in p.T], -1)
-        after = np.clip(np.searchsorted(gnss.t, begins), 1, len(gnss.t) - 1)
-        away = np.minimum(np.abs(gnss.t[after] - begins), np.abs(begins - gnss.t[after - 1]))
+        away = np.abs(gnss.t[pick_nearest(gnss.t, begins)] - begins)
     sigma = np.repeat((100.0 + _FASTEST_VEHICLE * away)[:, None], 3, axis=1)
     return Parameter(PLACE, place, sigma, "m", begins=begins)

@@ -202,7 +202,7 @@ def make_wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
     stated = bool(np.any(lever))
     sigma_axle = s.axle_sigma if stated else s.unstated_axle_sigma
     if sigma_axle > 0:
-        parameters.append(Parameter(AXLE, np.zeros(1), np.full(1, sigma_axle), "m"))
+        parameters.append(Parameter.centred(AXLE, 1, sigma_axle, "m"))
     return lever, parameters
 
 
@@ -239,7 +239,7 @@ class NonHolonomic(Wheels):
         lever_arm, parameters = make_wheel_parameters(scene)
         if s.body_sigma > 0:
             parameters.append(
-                Parameter(BODY, np.zeros(2), np.full(2, s.body_sigma), "rad s^2/m, of lateral and forward acceleration")
+                Parameter.centred(BODY, 2, s.body_sigma, "rad s^2/m, of lateral and forward acceleration")
             )
         density = np.asarray(s.nhc_density) / np.sqrt(scene.intervals.T[rows])[:, None]
         beyond = np.maximum(np.abs(past.force[:, 0]) - _LINEAR_TYRES, 0.0)

@@ -8,8 +8,10 @@ frames as in Groves, *Principles of GNSS, Inertial, and Multisensor Integrated N
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -37,30 +39,27 @@ def llh_to_ecef(llh: Array) -> Array:
     return stack_columns((n + h) * c * np.cos(lon), (n + h) * c * np.sin(lon), (n * (1 - E2) + h) * s)
 
 
-def _find_normal(r: Array) -> tuple[Array, Array, Array]:
-    """Sine and cosine of geodetic latitude and the distance from the axis (Bowring 1976, closed form).
+def _find_normal(x: Any, y: Any, z: Any, sqrt: Callable[[Any], Any] = np.sqrt) -> tuple[Any, Any, Any, Any]:
+    """Sine and cosine of geodetic latitude, the distance from the axis, and the height, of points in ECEF (Bowring
+    1976, closed form).
 
     In error by less than 1e-12 rad below 10 km of height.
     """
-    r = np.asarray(r, dtype=float)
-    x, y, z = r[..., 0], r[..., 1], r[..., 2]
-    p = np.sqrt(x * x + y * y)
+    p = sqrt(x * x + y * y)
     za, pb = z * A, p * B
-    size = np.sqrt(za * za + pb * pb)
+    size = sqrt(za * za + pb * pb)
     up, out = z + _EP2 * B * (za / size) ** 3, p - E2 * A * (pb / size) ** 3
-    size = np.sqrt(up * up + out * out)
-    return up / size, out / size, p
-
-
-def _find_height(r: Array, s: Array, c: Array, p: Array) -> Array:
-    """Height of points in ECEF by `_find_normal` of them, m."""
-    return np.asarray(p * c + r[..., 2] * s - A * np.sqrt(1.0 - E2 * s * s))
+    size = sqrt(up * up + out * out)
+    s, c = up / size, out / size
+    return s, c, p, p * c + z * s - A * sqrt(1.0 - E2 * s * s)
 
 
 def ecef_to_llh(r: Array) -> Array:
     """Inverse of `llh_to_ecef`, exact to a micrometre below 10 km of height."""
-    s, c, p = _find_normal(r)
-    return np.stack([np.arctan2(s, c), np.arctan2(r[..., 1], r[..., 0]), _find_height(r, s, c, p)], -1)
+    r = np.asarray(r, dtype=float)
+    x, y, z = r[..., 0], r[..., 1], r[..., 2]
+    s, c, _, h = _find_normal(x, y, z)
+    return np.stack([np.arctan2(s, c), np.arctan2(y, x), h], -1)
 
 
 def enu_axes(llh: Array) -> Array:
@@ -79,24 +78,15 @@ def gravity(lat: Array, h: Array) -> Array:
     return _compute_gravity(np.sin(lat) ** 2, h)
 
 
-def _compute_gravity(s2: Array, h: Array) -> Array:
-    surface = _GAMMA_E * (1.0 + _K_SOMIGLIANA * s2) / np.sqrt(1.0 - E2 * s2)
+def _compute_gravity(s2: Any, h: Any, sqrt: Callable[[Any], Any] = np.sqrt) -> Any:
+    surface = _GAMMA_E * (1.0 + _K_SOMIGLIANA * s2) / sqrt(1.0 - E2 * s2)
     return surface * (1.0 - 2.0 / A * (1.0 + FLATTENING + _M - 2.0 * FLATTENING * s2) * h + 3.0 * (h / A) ** 2)
 
 
-def _compute_gravity_one(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Gravity (m/s^2) at one point, both in ECEF: `_find_normal` and `_compute_gravity` for scalars."""
-    p = math.sqrt(x * x + y * y)
-    za, pb = z * A, p * B
-    size = math.sqrt(za * za + pb * pb)
-    up, out = z + _EP2 * B * (za / size) ** 3, p - E2 * A * (pb / size) ** 3
-    size = math.sqrt(up * up + out * out)
-    s, c = up / size, out / size
-    s2 = s * s
-    root = math.sqrt(1.0 - E2 * s2)
-    h = p * c + z * s - A * root
-    g = -_GAMMA_E * (1.0 + _K_SOMIGLIANA * s2) / root
-    g *= 1.0 - 2.0 / A * (1.0 + FLATTENING + _M - 2.0 * FLATTENING * s2) * h + 3.0 * (h / A) ** 2
+def _list_gravity(x: Any, y: Any, z: Any, sqrt: Callable[[Any], Any] = np.sqrt) -> tuple[Any, Any, Any]:
+    """The components of gravity (m/s^2) at points, all in ECEF."""
+    s, c, p, h = _find_normal(x, y, z, sqrt)
+    g = -_compute_gravity(s * s, h, sqrt)
     return g * c / p * x, g * c / p * y, g * s
 
 
@@ -156,9 +146,10 @@ class LocalFrame:
     def level(self, p_n: Array) -> tuple[Array, Array]:
         """(lat, lon, h) (n, 3) of positions in n, and `R_ln` there by `rotation.move_components_first`, (3, 3, n)."""
         r = self.r_e + p_n @ self.R_ne
-        s, c, p = _find_normal(r)
-        llh = stack_columns(np.arctan2(s, c), np.arctan2(r[:, 1], r[:, 0]), _find_height(r, s, c, p))
-        axes = np.array(_list_enu_axes(s, c, r[:, 1] / p, r[:, 0] / p)).reshape(3, 3, -1)
+        x, y, z = r.T
+        s, c, p, h = _find_normal(x, y, z)
+        llh = stack_columns(np.arctan2(s, c), np.arctan2(y, x), h)
+        axes = np.array(_list_enu_axes(s, c, y / p, x / p)).reshape(3, 3, -1)
         return llh, self.R_ne @ axes
 
     def gravity_n(self, p_n: Array) -> Array:
@@ -169,8 +160,6 @@ class LocalFrame:
         """
         r = self.r_e + np.asarray(p_n, dtype=float) @ self.R_ne
         if r.size == 3:  # fast path for the single points of a filter
-            return (np.array(_compute_gravity_one(*r.ravel().tolist())) @ self.R_ne.T).reshape(r.shape)
-        s, c, p = _find_normal(r)
-        size = -_compute_gravity(s * s, _find_height(r, s, c, p))
-        down = np.stack([size * c / p * r[..., 0], size * c / p * r[..., 1], size * s], -1)
-        return down @ self.R_ne.T
+            x, y, z = r.ravel().tolist()
+            return (np.array(_list_gravity(x, y, z, math.sqrt)) @ self.R_ne.T).reshape(r.shape)
+        return np.stack(_list_gravity(r[..., 0], r[..., 1], r[..., 2]), -1) @ self.R_ne.T

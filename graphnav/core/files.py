@@ -35,23 +35,22 @@ ZIP, ARCHIVE = b"PK\3\4", "is a zip archive or a spreadsheet; unpack it, or save
 Kind = type[GraphnavError]
 
 
-def resolve_beside(source: Path, name: str, key: str, allow_outside: bool, error: Kind = RecordingError) -> Path:
+def resolve_beside(source: Path, name: str, key: str, allow_outside: bool) -> Path:
     """The path of a file that is named in `source` under `key`.
 
     Raises
     ------
-    GraphnavError
-        Of the kind given, if it is no path at all, or lies outside the folder of `source`, symbolic links followed, and
-        may not.
+    RecordingError
+        If it is no path at all, or lies outside the folder of `source`, symbolic links followed, and may not.
     """
     path = source.parent / name
-    if not is_inside(path, source.parent, error) and not allow_outside:
-        raise error(
+    if not is_inside(path, source.parent) and not allow_outside:
+        raise RecordingError(
             f"{source}: '{key}' names a file outside the folder that it lies in; move it there, or use --allow-outside "
             "if you trust who wrote this",
             key="file.outside",
         )
-    exists(path, error)
+    exists(path)
     return path
 
 
@@ -63,18 +62,18 @@ def is_inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
         raise error(f"{_shorten(path)}: is no path of a file", key="file.name") from None
 
 
-def check_inside(files: Iterable[Path], source: Path, error: Kind = RecordingError) -> None:
+def check_inside(files: Iterable[Path], source: Path) -> None:
     """Refuse files of a folder that are links to somewhere outside it.
 
     Raises
     ------
-    GraphnavError
-        Of the kind given.
+    RecordingError
+        Naming the first.
     """
     folder = source if source.is_dir() else source.parent
     for file in files:
-        if file.is_symlink() and not is_inside(file, folder, error):
-            raise error(
+        if file.is_symlink() and not is_inside(file, folder):
+            raise RecordingError(
                 f"{file}: is a link to outside of {folder}; use --allow-outside if you trust who made it",
                 key="file.outside",
             )

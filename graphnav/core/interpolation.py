@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
@@ -112,6 +113,13 @@ def interpolate(
         satellites=None if trajectory.satellites is None else trajectory.satellites[near],
     )  # fmt: skip
     return out, ok
+
+
+def pick_nearest(rows: Array, t: Array) -> NDArray[np.intp]:
+    """The nearest of N > 0 rows, whose times (N,) are in order, to each time (M,); of two as near the later."""
+    right = np.minimum(np.searchsorted(rows, t), len(rows) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(np.abs(rows[left] - t) < np.abs(rows[right] - t), left, right)
 
 
 def differentiate(trajectory: Trajectory, max_gap: float) -> Array:

@@ -26,8 +26,10 @@ _ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
 
 def _write_value(value: Any, line: str) -> str:
-    """A value as JSON; `line` is a line end with the indentation of the next line."""
+    """A value as JSON; `line` is a line end with the indentation of the next line. A function of that is called."""
     deeper = line + "  "
+    if callable(value):
+        return str(value(line))
     if isinstance(value, Mapping):
         inner = [f"{_ENCODER.encode(str(key))}: {_write_value(one, deeper)}" for key, one in value.items()]
         return f"{{{deeper}{f',{deeper}'.join(inner)}{line}}}" if inner else "{}"

@@ -22,6 +22,14 @@ class Note(str):
         return Note, (self.key, str(self))
 
 
+class Notes(list[str]):
+    """Notes in the order in which they were made."""
+
+    def add(self, key: str, sentence: str) -> None:
+        """Add a note under a key."""
+        self.append(Note(key, sentence))
+
+
 def get_key(sentence: str) -> str:
     """The key of a sentence, "" if it has none."""
     return sentence.key if isinstance(sentence, Note) else ""

@@ -84,6 +84,18 @@ def _evaluate_polynomial(v: Array, first: Array, second: Array) -> Array:
     return _I3 + first[..., None, None] * S + second[..., None, None] * (S @ S)
 
 
+def _evaluate_polynomial_one(x: float, y: float, z: float, a: float, b: float) -> Array:
+    """`_evaluate_polynomial` of a single vector: (3, 3)."""
+    xy, xz, yz = b * x * y, b * x * z, b * y * z
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), xy - a * z, xz + a * y],
+            [xy + a * z, 1.0 - b * (x * x + z * z), yz - a * x],
+            [xz - a * y, yz + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
+
+
 def exp(v: Array) -> Array:
     """Exp of rotation vectors: (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=float)
@@ -98,15 +110,7 @@ def _exp_one(x: float, y: float, z: float) -> Array:
     """`exp` of a single vector."""
     n = math.sqrt(x * x + y * y + z * z + _TINY)
     half = math.sin(0.5 * n) / n
-    a, b = math.sin(n) / n, 2.0 * half * half
-    xy, xz, yz = b * x * y, b * x * z, b * y * z
-    return np.array(
-        [
-            [1.0 - b * (y * y + z * z), xy - a * z, xz + a * y],
-            [xy + a * z, 1.0 - b * (x * x + z * z), yz - a * x],
-            [xz - a * y, yz + a * x, 1.0 - b * (x * x + y * y)],
-        ]
-    )
+    return _evaluate_polynomial_one(x, y, z, math.sin(n) / n, 2.0 * half * half)
 
 
 def log(R: Array) -> Array:
@@ -159,22 +163,12 @@ def right_jacobian_inverse(v: Array) -> Array:
 
 
 def _right_jacobian_inverse_one(x: float, y: float, z: float) -> Array:
-    """`right_jacobian_inverse` of a single vector: I + S/2 + c (v v^T - v.v I)."""
+    """`right_jacobian_inverse` of a single vector."""
     n2 = x * x + y * y + z * z
     if n2 < 1e-4:
-        c = 1.0 / 12.0 + n2 / 720.0
-    else:
-        n = math.sqrt(n2)
-        c = (1.0 - 0.5 * n / math.tan(0.5 * n)) / n2
-    one, x2, y2, z2 = 1.0 - c * n2, 0.5 * x, 0.5 * y, 0.5 * z
-    xy, xz, yz = c * x * y, c * x * z, c * y * z
-    return np.array(
-        [
-            [one + c * x * x, xy - z2, xz + y2],
-            [xy + z2, one + c * y * y, yz - x2],
-            [xz - y2, yz + x2, one + c * z * z],
-        ]
-    )
+        return _evaluate_polynomial_one(x, y, z, 0.5, 1.0 / 12.0 + n2 / 720.0)
+    n = math.sqrt(n2)
+    return _evaluate_polynomial_one(x, y, z, 0.5, (1.0 - 0.5 * n / math.tan(0.5 * n)) / n2)
 
 
 def to_quaternion(R: Array) -> Array:

@@ -51,9 +51,13 @@ class Parameter:
     spacing: float = NODE_SPACING  # s, at least, between two nodes
     begins: Array | None = None  # (n,) s; if given, `initial` and `sigma` apply anew from each of these times on
     reported: bool = False  # whether a solution reports its values
-    noise_groups: tuple[
-        str, ...
-    ] = ()  # (k,) of a process: name of the variance component (`graphnav.estimation.noise`) of each number
+    # (k,) of a process: name of the variance component (`graphnav.estimation.noise`) of each number
+    noise_groups: tuple[str, ...] = ()
+
+    @classmethod
+    def centred(cls, name: str, size: int, sigma: float, unit: str, walk: float = 0.0, **more: Any) -> Parameter:
+        """One of `size` components about zero, with one sigma for all of them."""
+        return cls(name, np.zeros(size), np.full(size, sigma), unit, walk, **more)
 
     @property
     def size(self) -> int:

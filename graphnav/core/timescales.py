@@ -21,7 +21,7 @@ _WHOLE = 0.99  # share of the period; a restarting clock steps back by at least 
 NEAR = 3600.0  # s; logs of one drive begin within this of each other
 UNIX = 1e9  # s; larger stamps are Unix time of this century
 GPS_TO_UNIX = 315964800.0  # s from the Unix to the GPS epoch, leap seconds excluded
-_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
+GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 # days on which GPS - UTC grew by one second, to 1 s at the first
 _LEAPS = np.array(
     [
@@ -55,7 +55,7 @@ def count_leap_seconds(utc: Array) -> Array:
 
 def utc_to_gps(utc: Array) -> Array:
     """Seconds since the GPS epoch of UTC dates (datetime64[us])."""
-    return (utc - _EPOCH) / np.timedelta64(1, "us") * 1e-6 + count_leap_seconds(utc)
+    return (utc - GPS_EPOCH) / np.timedelta64(1, "us") * 1e-6 + count_leap_seconds(utc)
 
 
 def unix_to_gps(t: Array) -> Array:
@@ -66,7 +66,7 @@ def unix_to_gps(t: Array) -> Array:
 
 def gps_to_utc(t: Array) -> Array:
     """UTC (datetime64[us]) of seconds since the GPS epoch; exact except within the second before a leap."""
-    gps = _EPOCH + np.round(np.asarray(t, dtype=float) * 1e6).astype("timedelta64[us]")
+    gps = GPS_EPOCH + np.round(np.asarray(t, dtype=float) * 1e6).astype("timedelta64[us]")
     leap = count_leap_seconds(gps)
     leap = count_leap_seconds(gps - (leap * 1e6).astype("timedelta64[us]"))
     return np.asarray(gps - (leap * 1e6).astype("timedelta64[us]"))

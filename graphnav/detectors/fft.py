@@ -23,7 +23,8 @@ import numpy as np
 
 from graphnav.config.detectors import FftSettings
 from graphnav.core.earth import MG
-from graphnav.core.notes import Note
+from graphnav.core.interpolation import pick_nearest
+from graphnav.core.notes import Note, Notes
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Mask, find_spans, mask_within
 from graphnav.detectors.motion import Speeds
@@ -83,20 +84,20 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         mask_within(t, labels.still, half) if labels else (quiet < 1.0) & ~mask_within(t, scene.certain, half)
     )
     line = find_idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
-    notes: list[str] = []
+    notes = Notes()
     if settings.find_line and line is None:
-        notes.append(Note("detectors.fft.no_line", _note_no_line(int(inner.sum()), settings, labels is None)))
+        notes.add("detectors.fft.no_line", _note_no_line(int(inner.sum()), settings, labels is None))
         if not shown:
             return Detection("fft", t, np.full(w.count, np.nan), 1.0, t < t, NONE, tuple(notes))
     factor = 1.0 if line is None else line.frequency / LINE_OF_THE_PAPER
     bands, clipped = _select_bands(settings, factor, w.frequencies)
     if clipped:
-        notes.append(Note("detectors.fft.bands_cut", clipped))
+        notes.add("detectors.fft.bands_cut", clipped)
     height, where, kept, spectrogram = _measure(w, bands)
     quotient = _compute_quotients(height, settings)
     asked: Mask = np.asarray(np.isfinite(quotient).any(axis=0))
     if line is not None:
-        notes.append(Note("detectors.fft.line", _describe_idling(line)))
+        notes.add("detectors.fft.line", _describe_idling(line))
         idling = inner & _detect_line(height, where, line)
         met = np.asarray((quotient[idling] < 1.0).mean(axis=0) >= _MET) if idling.any() else asked
         if labels is None:
@@ -106,11 +107,9 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         quotient = np.column_stack([quotient, _measure_off_line(where, asked, line)])
         asked = np.append(asked, True)
         if left_out:
-            notes.append(
-                Note(
-                    "detectors.fft.conditions",
-                    f"FFT detector: without the conditions that the idling engine does not meet: {', '.join(left_out)}",
-                )
+            notes.add(
+                "detectors.fft.conditions",
+                f"FFT detector: without the conditions that the idling engine does not meet: {', '.join(left_out)}",
             )
     usable = asked[3:8].any() and (line is not None or not settings.find_line)
     found = np.full(w.count, np.nan)
@@ -215,8 +214,7 @@ def _divide_speed(t: Array, settings: FftSettings, speeds: Sequence[Speeds]) -> 
     out = np.zeros(len(t))
     half = 0.5 * settings.window
     for s in speeds:
-        k = np.clip(np.searchsorted(s.t, t), 1, len(s.t) - 1)
-        k -= (t - s.t[k - 1]) < (s.t[k] - t)
+        k = pick_nearest(s.t, t)
         near = np.abs(s.t[k] - t) < half
         three = np.clip(k[:, None] + [-1, 0, 1], 0, len(s.t) - 1)
         excess = np.median(s.speed[three] / np.maximum(settings.max_speed, s.limit[three]), axis=1)

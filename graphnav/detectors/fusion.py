@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 
 from graphnav.config.detectors import FusionSettings
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import (
     NONE,
@@ -139,33 +139,24 @@ def find_candidates(scene: Scene, found: Detection, row: Scale) -> tuple[Array, 
     moves = np.array([_contradicts_speed(b, span, speeds, scene.settings.fusion) for span in spans]) & np.isnan(known)
     rest = np.flatnonzero(~moves)  # a moving vehicle may brake steadily: the integral of its force counts, not the mean
     moves[rest] = find_moving_by_chain([link(b, *pair) for pair in pairwise(spans[rest])], known[rest])
-    notes = []
+    notes = Notes()
     measured = int((np.nan_to_num(known) > 0.0).sum())
     if measured:
-        notes.append(
-            Note(
-                "detectors.speed_known",
-                f"{_count(measured)} not taken as a stop: odometer or GNSS show motion",
-            )
-        )
+        notes.add("detectors.speed_known", f"{_count(measured)} not taken as a stop: odometer or GNSS show motion")
     if moves.sum() > measured:
-        notes.append(
-            Note(
-                "detectors.speed_felt",
-                f"{_count(int(moves.sum()) - measured)} not taken as a stop: the force before or after shows motion",
-            )
+        notes.add(
+            "detectors.speed_felt",
+            f"{_count(int(moves.sum()) - measured)} not taken as a stop: the force before or after shows motion",
         )
     share = _share_still_in_motion(found, certain)
     if share > _BLIND:
         unseen = ~moves & np.isnan(known) & np.array([not _reads_zero(speeds, span) for span in spans])
         moves |= unseen
-        notes.append(
-            Note(
-                "detectors.still_in_motion",
-                f"{100.0 * share:.0f} % of the seconds in certain motion are as quiet as a stop (a simulation without "
-                "a road?): a stop needs a measured speed as well, which leaves out "
-                f"{format_count(int(unseen.sum()), 'stretch', 'stretches')}",
-            )
+        notes.add(
+            "detectors.still_in_motion",
+            f"{100.0 * share:.0f} % of the seconds in certain motion are as quiet as a stop (a simulation without "
+            "a road?): a stop needs a measured speed as well, which leaves out "
+            f"{format_count(int(unseen.sum()), 'stretch', 'stretches')}",
         )
     spans = subtract_spans(spans[~moves], certain)
     if not by_rows and len(certain):  # ends set by certain motion are as uncertain as its timing

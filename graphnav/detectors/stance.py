@@ -30,7 +30,7 @@ import numpy as np
 
 from graphnav.config.detectors import FUSED, StanceSettings
 from graphnav.core import rotation
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Note, Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, drop_short, find_spans, mask_inside, merge_spans, unite
 from graphnav.detectors.glrt import compute_glrt
@@ -63,7 +63,7 @@ def detect_stances(
         )
     bias, g = _average_quietest(imu, period)
     found: list[Detection] = []
-    kept, notes = [], []
+    kept, notes = [], Notes()
     for name in which:
         e = np.sqrt(compute_glrt(imu.accel, imu.gyro - bias, window, settings.force_per_rate, 1.0, g, name))
         found.append(_find_below(name, e, imu, period, window, settings))
@@ -71,12 +71,7 @@ def detect_stances(
         deep = one.intervals[_mask_deep(one.intervals, one.t, one.statistic, settings.threshold)]
         if len(deep) < len(one.intervals):
             short = format_count(len(one.intervals) - len(deep), "interval")
-            notes.append(
-                Note(
-                    "detectors.stance.lulls",
-                    f"{short} left out: less quiet than the stances",
-                )
-            )
+            notes.add("detectors.stance.lulls", f"{short} left out: less quiet than the stances")
         begin = int(np.searchsorted(deep[:, 1], since)) if len(deep) else 0
         cut = _cut_sliding(deep[begin:], imu, one.t, one.statistic, bias, settings.threshold * _SOLE_REACH)
         kept.append(np.concatenate([deep[:begin], cut]))

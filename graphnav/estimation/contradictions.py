@@ -40,7 +40,7 @@ from graphnav.constraints.gnss import (
     free_constants,
 )
 from graphnav.constraints.odometer import ODOMETER_DELAY, OdometerSpeed
-from graphnav.core.notes import Note
+from graphnav.core.notes import Notes
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.noise.apply import apply_noise
@@ -287,7 +287,7 @@ def compute_prior_cost(base: Problem, freed: Freed) -> float:
 
 def describe_freed(freed: Freed, recording: Recording) -> tuple[str, ...]:
     """Notes on constants that are not used as stated."""
-    notes = []
+    notes = Notes()
     if recording.gnss is not None and LEVER_ARM in freed:
         arms = recording.gnss.lever_arm, freed[LEVER_ARM].value
         stated, found = (", ".join(f"{x:.2f}" for x in some) for some in arms)
@@ -295,7 +295,7 @@ def describe_freed(freed: Freed, recording: Recording) -> tuple[str, ...]:
             f"antenna: the drive contradicts lever_arm in [gnss] as stated, [{stated}] m, and is solved with [{found}] "
             "m (right, forward, up of the IMU), as it finds it: measure it, or state what was found"
         )
-        notes.append(Note("gnss.lever_arm_used", sentence))
+        notes.add("gnss.lever_arm_used", sentence)
     late = [(words, freed[name].value[0]) for name, words in _STAMPS.items() if name in freed]
     if late:
         by = " and ".join(f"{seconds:+.3f} s ({words})" for words, seconds in late)
@@ -303,21 +303,21 @@ def describe_freed(freed: Freed, recording: Recording) -> tuple[str, ...]:
             f"stamps of the fixes: the drive contradicts them and is solved with {by} added: add it to time_offset in "
             "[gnss]"
         )
-        notes.append(Note("gnss.time_offset_used", sentence))
+        notes.add("gnss.time_offset_used", sentence)
     if ODOMETER_DELAY in freed:
         late_by = freed[ODOMETER_DELAY].value[0]
         sentence = (
             f"odometer: the drive contradicts its stamps and is solved with readings {late_by:.3f} s late: take it off "
             "them, or state delay_sigma in [odometer]"
         )
-        notes.append(Note("odometer.delay_used", sentence))
+        notes.add("odometer.delay_used", sentence)
     if CLOCK_RATE in freed:
         ppm = freed[CLOCK_RATE].value[0] * 1e6
         sentence = (
             f"clocks of IMU and fixes drift apart: the IMU's gains {ppm:.0f} ppm on that of the fixes, as the drive "
             "finds it, and their stamps are corrected by it"
         )
-        notes.append(Note("gnss.clock_rate_used", sentence))
+        notes.add("gnss.clock_rate_used", sentence)
     return tuple(notes)
 
 

@@ -20,7 +20,7 @@ from graphnav.constraints.raw_selection import check_masks
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.memory import return_memory
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, Notes
 from graphnav.core.progress import Progress, send_progress, tell
 from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
@@ -153,15 +153,15 @@ def _run(
     if unknown:
         raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}", key="solver.unknown")
     frame = LocalFrame(choose_origin(recording), recording.start)
-    pieces, notes = split_pieces(recording, settings)
-    notes = [*check_profile(recording, settings), *notes]
+    pieces, cuts = split_pieces(recording, settings)
+    notes = Notes([*check_profile(recording, settings), *cuts])
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in split_drive(piece, settings)]
     if len(parts) > 1:
         return_memory()
     if len(parts) > len(pieces):
         sentence = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
-        notes.append(Note("pieces.parts", sentence))
+        notes.add("pieces.parts", sentence)
     for part in parts:
         try:
             # matrices here have thirty rows: threading costs more than the work, twenty times as much on a busy machine
@@ -175,7 +175,7 @@ def _run(
         except EstimationError as error:
             if len(parts) == 1:
                 raise
-            notes.append(Note("pieces.left_out", f"{describe_span(recording, part.recording)} left out: {error}"))
+            notes.add("pieces.left_out", f"{describe_span(recording, part.recording)} left out: {error}")
     if not found:
         raise EstimationError(
             f"'{recording.name}': no piece between its IMU gaps can be solved", key="pieces.none_solved"

@@ -11,7 +11,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints import list_kinds
-from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, keep_apart
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
 from graphnav.core.findings import describe_gaps
@@ -253,13 +253,7 @@ def _build_chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterC
 
 @lru_cache(maxsize=16)  # a noise model's passes build the same chains repeatedly
 def _keep_apart(keyframes: bytes, spacing: float) -> Array:
-    """The keyframes that are at least `spacing` apart, independent of later ones."""
-    t = np.frombuffer(keyframes)
-    out = [float(t[0])]
-    for x in t.tolist():
-        if x - out[-1] >= spacing - SAME_TIME:
-            out.append(x)
-    return np.array(out)
+    return keep_apart(np.frombuffer(keyframes), spacing - SAME_TIME)
 
 
 def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]:

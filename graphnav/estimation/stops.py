@@ -27,6 +27,10 @@ class Stop:
     fired: Mapping[str, float]  # share of it that each detector calls stationary; detectors that call none are omitted
     rows: Mapping[str, int]  # number of rows of each constraint that were used because of it
 
+    def format_fired(self) -> str:
+        """The detectors that found it, and the share that each found."""
+        return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in self.fired.items())
+
     def to_dict(self) -> dict[str, Any]:
         """The stop for JSON."""
         fired = {name: round(share, 3) for name, share in self.fired.items()}

@@ -17,7 +17,7 @@ from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import fit_yaw, interpolate, place_on_earth
-from graphnav.core.notes import Note, format_count, get_key
+from graphnav.core.notes import Note, Notes, format_count, get_key
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.core.timescales import LEAP, NEAR, compute_clock_offset
@@ -106,10 +106,10 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         If it cannot be read, shares no time with the recording, or its point is the antenna and there is no GNSS.
     """
     track = read_trajectory(asked.path)
-    notes: list[str] = list(track.notes)
+    notes = Notes(track.notes)
     if asked.shift is not None:
         track = replace(track, t=track.t + asked.shift)
-        notes.append(Note("against.shift", f"{asked.path.name}: stamps shifted by {asked.shift:+g} s, as asked"))
+        notes.add("against.shift", f"{asked.path.name}: stamps shifted by {asked.shift:+g} s, as asked")
     else:
         shift, words = _shift(asked.path, track, recording, reference)
         track = replace(track, t=track.t + shift)
@@ -128,11 +128,9 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         require_right_handed(str(asked.path), track.llh[inside], p)
         yaw, offset = fit_yaw(track.llh[inside], p)
         track = place_on_earth(track, reference.frame, yaw, offset)
-        notes.append(
-            Note(
-                "against.frame",
-                f"{asked.path.name}: metres in a local frame, rotated by {np.degrees(yaw):.1f} deg onto ours",
-            )
+        notes.add(
+            "against.frame",
+            f"{asked.path.name}: metres in a local frame, rotated by {np.degrees(yaw):.1f} deg onto ours",
         )
     arm, ours = asked.point, find_antenna_lever_arm(recording, reference)
     lever_arm = None if recording.gnss is None else recording.gnss.lever_arm
@@ -148,11 +146,9 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     borrowed = track.rph is None
     if borrowed:
         track = _borrow_attitude(track, reference)
-        notes.append(
-            Note(
-                "against.no_attitude",
-                f"{asked.path.name}: has no attitude; that of {reference.solver} places its lever arm",
-            )
+        notes.add(
+            "against.no_attitude",
+            f"{asked.path.name}: has no attitude; that of {reference.solver} places its lever arm",
         )
     elif recording.truth is None or recording.truth.rph is None:  # else it is compared with that
         inside = (track.t >= reference.t[0]) & (track.t <= reference.t[-1])
@@ -163,10 +159,8 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         notes.extend(Note(get_key(one), f"{asked.path.name}: {one}") for one in other)
     if np.any(arm):
         track = interpolate(track, track.t, max_gap=_MAX_GAP, lever_arm=-arm)[0]
-        notes.append(
-            Note(
-                "against.point", f"{asked.path.name}: moved to the IMU from [{format_arm(arm)}] m (right, forward, up)"
-            )
+        notes.add(
+            "against.point", f"{asked.path.name}: moved to the IMU from [{format_arm(arm)}] m (right, forward, up)"
         )
     notes += _find_other_point(asked.path, track, arm, ours, reference)
     track = replace(track, name=name)
@@ -180,51 +174,34 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     )  # fmt: skip
 
 
-def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solution) -> tuple[float, list[str]]:
+def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solution) -> tuple[float, Notes]:
     """s to add to the stamps of a trajectory, and the reason."""
     known = compute_clock_offset(recording.start, recording.gps_zero, float(track.t[0]), track.gps_zero)
-    own_start, on_a_clock = recording.start - float(track.t[0]), True
-    notes: list[str] = []
+    notes, on_a_clock = Notes(), True
     if track.t[-1] > recording.start and track.t[0] < recording.end:
         shift = 0.0
     elif known is not None and abs(track.t[0] + known.offset - recording.start) < NEAR:
-        shift, notes = (
-            known.offset,
-            [Note("against.clock", f"{path.name}: stamps shifted by {known.offset:+.0f} s: {known.words}")],
-        )
+        shift = known.offset
+        notes.add("against.clock", f"{path.name}: stamps shifted by {shift:+.0f} s: {known.words}")
     elif abs(track.t[0]) < NEAR:
-        shift, on_a_clock, notes = (
-            own_start,
-            False,
-            [
-                Note(
-                    "against.clock",
-                    f"{path.name}: stamps shifted by {own_start:+.3f} s: they are counted from the start of the file",
-                )
-            ],
-        )
+        shift, on_a_clock = recording.start - float(track.t[0]), False
+        why = "they are counted from the start of the file"
+        notes.add("against.clock", f"{path.name}: stamps shifted by {shift:+.3f} s: {why}")
     else:
-        return 0.0, []  # given by the caller
+        return 0.0, notes  # given by the caller
     late = _measure_delay(replace(track, t=track.t + shift), reference)
     if late is None:
         return shift, notes
     if abs(late) < _APPLIED and on_a_clock:
         word = "early" if late > 0.0 else "late"
-        return shift, [
-            *notes,
-            Note("against.late", f"{path.name}: by its speed {abs(late):.3f} s {word} against ours; not corrected"),
-        ]
+        notes.add("against.late", f"{path.name}: by its speed {abs(late):.3f} s {word} against ours; not corrected")
+        return shift, notes
     leap = ""
     if abs(abs(late) - LEAP) < 0.1:
         late, leap = float(np.copysign(LEAP, late)), ": the leap seconds between UTC and GPS time"
-    return shift + late, [
-        *notes,
-        Note(
-            "against.late",
-            f"{path.name}: stamps shifted by {'another ' if shift else ''}{late:+.3f} s, where its speed agrees with "
-            f"ours{leap}",
-        ),
-    ]
+    by = f"{'another ' if shift else ''}{late:+.3f} s"
+    notes.add("against.late", f"{path.name}: stamps shifted by {by}, where its speed agrees with ours{leap}")
+    return shift + late, notes
 
 
 def _require_same_drive(asked: Against, track: Trajectory, recording: Recording, reference: Solution) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, Notes
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import GPS_TO_UNIX, LEAP, compute_clock_offset, shift_stamps, shift_stamps_back
 from graphnav.core.trajectory import Trajectory
@@ -171,9 +171,9 @@ def make_withheld_truth(
         raise RecordingError(
             f"'{recording.name}': no GNSS fix in the withheld spans to compare with", key="truth.no_withheld_fix"
         )
-    notes = [Note("truth.withheld_gnss", "the truth is the withheld GNSS itself")]
+    notes = Notes([Note("truth.withheld_gnss", "the truth is the withheld GNSS itself")])
     if np.any(antenna.clock_offset) or np.any(antenna.clock_rate):
-        notes.append(Note("truth.clock_offset", "the stamps of the withheld fixes are moved as estimated"))
+        notes.add("truth.clock_offset", "the stamps of the withheld fixes are moved as estimated")
     truth = Trajectory(
         moved[mask], gnss.llh[mask], sd_p=gnss.sd[mask],
         v=None if gnss.v is None else gnss.v[mask],

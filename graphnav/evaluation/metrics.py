@@ -19,7 +19,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.sample_size import chi_square_band, chi_square_quantile, count_effective_epochs
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Errors:
     """Estimate minus truth at N common epochs; NaN where either lacks the quantity."""
 
@@ -140,6 +140,11 @@ COMPONENTS = {
     "pitch": ("pitch", "deg", "deg"),
     "heading": ("heading", "deg", "deg"),
 }
+# of a span: key -> field of `SpanErrors`
+_SPAN_FIELDS = {
+    "distance_m": "distance", "end_h_m": "end_h", "end_3d_m": "end_3d", "max_h_m": "max_h", "max_up_m": "max_up",
+    "drift_mps": "drift", "drift_percent": "drift_percent", "nees_p": "nees",
+}  # fmt: skip
 _NEES = {"p": "position", "e": "east", "n": "north", "up": "up", "v": "velocity", "rph": "attitude"}
 
 
@@ -254,35 +259,31 @@ def summarise(metrics: Metrics) -> dict[str, Any]:
     out: dict[str, Any] = {
         "n": metrics.n,
         "epochs": metrics.epochs,
-        "duration_s": _round(metrics.duration),
-        "distance_m": _round(metrics.distance),
+        "duration_s": round_figure(metrics.duration),
+        "distance_m": round_figure(metrics.distance),
     }
     for key, s in metrics.components.items():
         unit = COMPONENTS[key][1]
-        out |= {f"{key}_{what}_{unit}": _round(getattr(s, what)) for what in ("rms", "p95", "max", "mean")}
+        out |= {f"{key}_{what}_{unit}": round_figure(getattr(s, what)) for what in ("rms", "p95", "max", "mean")}
     for key, nees in metrics.nees.items():
-        out[f"nees_{key}"] = _round(nees.mean)
-        out[f"nees_{key}_inside_95"] = _round(nees.inside)
-        out[f"nees_{key}_band_if_independent"] = [_round(nees.low), _round(nees.high)]
-        out[f"nees_{key}_band"] = [_round(x) for x in chi_square_band(nees.dof, nees.effective)]
+        out[f"nees_{key}"] = round_figure(nees.mean)
+        out[f"nees_{key}_inside_95"] = round_figure(nees.inside)
+        out[f"nees_{key}_band_if_independent"] = [round_figure(nees.low), round_figure(nees.high)]
+        out[f"nees_{key}_band"] = [round_figure(x) for x in chi_square_band(nees.dof, nees.effective)]
     if metrics.closure is not None:
         c = metrics.closure
         out |= {
-            "closure_h_m": _round(c.horizontal),
-            "closure_up_m": _round(c.vertical),
-            "closure_distance_m": _round(c.distance),
-            "closure_percent": _round(c.percent),
+            "closure_h_m": round_figure(c.horizontal),
+            "closure_up_m": round_figure(c.vertical),
+            "closure_distance_m": round_figure(c.distance),
+            "closure_percent": round_figure(c.percent),
         }
     if metrics.spans:
         out["spans"] = [
-            {
-                "start_s": s.start, "end_s": s.end, "n": s.n, "distance_m": _round(s.distance),
-                "end_h_m": _round(s.end_h), "end_3d_m": _round(s.end_3d), "max_h_m": _round(s.max_h),
-                "max_up_m": _round(s.max_up), "drift_mps": _round(s.drift),
-                "drift_percent": _round(s.drift_percent), "nees_p": _round(s.nees),
-            }
+            {"start_s": s.start, "end_s": s.end, "n": s.n}
+            | {name: round_figure(getattr(s, field)) for name, field in _SPAN_FIELDS.items()}
             for s in metrics.spans
-        ]  # fmt: skip
+        ]
     if metrics.notes:
         out["notes"] = list(metrics.notes)
     return out
@@ -346,7 +347,8 @@ def write_comparison_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) ->
         writer.writerows(dict(row) for row in rows)
 
 
-def _round(x: float) -> float | None:
+def round_figure(x: float) -> float | None:
+    """Five significant digits, None for no number."""
     return float(f"{x:.5g}") if math.isfinite(x) else None
 
 

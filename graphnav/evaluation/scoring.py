@@ -9,8 +9,15 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame, enu_axes, llh_to_ecef
 from graphnav.core.errors import RecordingError
-from graphnav.core.interpolation import differentiate, fill_covariance, fit_yaw, interpolate, place_on_earth
-from graphnav.core.notes import Note
+from graphnav.core.interpolation import (
+    differentiate,
+    fill_covariance,
+    fit_yaw,
+    interpolate,
+    pick_nearest,
+    place_on_earth,
+)
+from graphnav.core.notes import Notes
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.evaluation.conventions import find_other_axes, find_other_heights, require_right_handed
@@ -56,30 +63,23 @@ def compute_errors(
     RecordingError
         If no epoch is shared, or a local frame cannot be fitted because nothing moves.
     """
-    notes = [*trajectory.notes, *truth.notes]
+    notes = Notes([*trajectory.notes, *truth.notes])
     if lever_arm is not None and not np.any(lever_arm):
         lever_arm = None
     if lever_arm is not None and trajectory.rph is None:
         arm = float(np.max(np.linalg.norm(lever_arm, axis=-1)))
-        notes.append(
-            Note(
-                "truth.lever_arm",
-                f"the estimate has no attitude, so the lever arm of {arm:.2f} m to the truth's point is ignored",
-            )
+        notes.add(
+            "truth.lever_arm",
+            f"the estimate has no attitude, so the lever arm of {arm:.2f} m to the truth's point is ignored",
         )
     elif lever_arm is not None and trajectory.covariance is None and trajectory.sd_rph is None:
-        notes.append(
-            Note(
-                "truth.lever_arm_sigma",
-                "the estimate has no attitude sigma, so the lever arm adds nothing to its position sigma",
-            )
+        notes.add(
+            "truth.lever_arm_sigma",
+            "the estimate has no attitude sigma, so the lever arm adds nothing to its position sigma",
         )
     if trajectory.covariance is None and trajectory.sd_p is not None:
-        notes.append(
-            Note(
-                "nees.no_correlations",
-                "NEES from the sigmas alone: the estimate comes without correlations between axes",
-            )
+        notes.add(
+            "nees.no_correlations", "NEES from the sigmas alone: the estimate comes without correlations between axes"
         )
     flat = truth.frame == "local" and bool(np.isnan(truth.llh[:, 2]).all())
     fitted = "local" in (trajectory.frame, truth.frame)
@@ -88,10 +88,8 @@ def compute_errors(
         trajectory, truth = _fit_frames(trajectory, truth, lever_arm, max_gap, at, notes)
     estimate, seen, travel, epochs = _pair_epochs(trajectory, truth, lever_arm, max_gap, at)
     if measure_spacing(truth.t) < measure_spacing(trajectory.t) if at is None else _are_between(seen.t, truth.t):
-        notes.append(
-            Note(
-                "truth.interpolated", "compared at the estimate's own epochs, to which the denser truth is interpolated"
-            )
+        notes.add(
+            "truth.interpolated", "compared at the estimate's own epochs, to which the denser truth is interpolated"
         )
 
     R_le = enu_axes(seen.llh)
@@ -124,9 +122,7 @@ def compute_errors(
     with np.errstate(divide="ignore", invalid="ignore"):
         per_axis = p**2 / np.diagonal(cov, axis1=-2, axis2=-1)[:, :3]
     if truth.v is None:
-        notes.append(
-            Note("truth.no_velocity", "the truth has no velocity: its direction of travel is taken from its positions")
-        )
+        notes.add("truth.no_velocity", "the truth has no velocity: its direction of travel is taken from its positions")
     speed = np.linalg.norm(travel, axis=1)
     moving = speed > _LEAST_SPEED
     along = np.where(moving[:, None], travel / np.where(moving, speed, 1.0)[:, None], np.nan)
@@ -180,7 +176,7 @@ def _fit_frames(
     lever_arm: Array | None,
     max_gap: float,
     at: Array | None,
-    notes: list[str],
+    notes: Notes,
 ) -> tuple[Trajectory, Trajectory]:
     """Place both on the Earth, fitting the local one to the other by yaw and offset (the truth to the estimate if both
     are).
@@ -201,13 +197,11 @@ def _fit_frames(
         )
     require_right_handed("the truth" if truth_is_local else trajectory.name or "the estimate", source, target)
     yaw, offset = fit_yaw(source, target)
-    notes.append(
-        Note(
-            "truth.fitted",
-            f"{'truth' if truth_is_local else 'estimate'} in a local frame: fitted by {np.rad2deg(yaw):.2f} deg of "
-            "yaw and "
-            f"an offset over {len(source)} epochs before scoring",
-        )
+    notes.add(
+        "truth.fitted",
+        f"{'truth' if truth_is_local else 'estimate'} in a local frame: fitted by {np.rad2deg(yaw):.2f} deg of "
+        "yaw and "
+        f"an offset over {len(source)} epochs before scoring",
     )
     if truth_is_local:
         if np.isnan(offset[2]):
@@ -218,24 +212,19 @@ def _fit_frames(
     return place_on_earth(trajectory, frame, yaw, offset), truth
 
 
-def _subtract_fit(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
+def _subtract_fit(cov: Array, estimate: Trajectory, notes: Notes) -> Array:
     """The covariance (N, 9, 9) after a fit, for errors that count from the estimate's own start."""
     if not np.isfinite(cov).all():
-        notes.append(
-            Note(
-                "nees.fit_unknown",
-                "NEES ignores the fit: there is no covariance of position and heading at every epoch",
-            )
+        notes.add(
+            "nees.fit_unknown", "NEES ignores the fit: there is no covariance of position and heading at every epoch"
         )
         return cov
     rest, larger = propagate_fit(cov, LocalFrame(estimate.llh[0]).from_llh(estimate.llh), estimate.v)
     by = f", which takes sigmas {larger:.2f} times as large as stated" if larger > _LARGER else ""
-    notes.append(
-        Note(
-            "nees.after_fit",
-            "NEES is of the errors after the fit; errors of position and heading are assumed to persist as in dead "
-            f"reckoning{by}",
-        )
+    notes.add(
+        "nees.after_fit",
+        "NEES is of the errors after the fit; errors of position and heading are assumed to persist as in dead "
+        f"reckoning{by}",
     )
     return rest
 
@@ -270,8 +259,7 @@ def measure_spacing(t: Array) -> float:
 
 def _are_between(t: Array, rows: Array) -> bool:
     """Whether some of the times are not those of rows, to 0.1 ms."""
-    k = np.clip(np.searchsorted(rows, t), 1, len(rows) - 1) if len(rows) > 1 else np.zeros(len(t), dtype=int)
-    return bool((np.minimum(np.abs(t - rows[k]), np.abs(t - rows[k - 1])) > 1e-4).any())
+    return bool((np.abs(t - rows[pick_nearest(rows, t)]) > 1e-4).any())
 
 
 def _compute_nees(e: Array, cov: Array) -> Array:

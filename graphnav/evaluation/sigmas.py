@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -30,6 +31,9 @@ class BlockVerdict:
     rest: str = ""  # verdict of position without height, or of attitude without heading
 
 
+_JUDGED: WeakKeyDictionary[Errors, tuple[BlockVerdict, ...]] = WeakKeyDictionary()  # each page asks several times
+
+
 def judge_sigmas(errors: Errors) -> tuple[BlockVerdict, ...]:
     """Test the sigmas of each block; blocks without errors or without sigmas are left out.
 
@@ -37,6 +41,8 @@ def judge_sigmas(errors: Errors) -> tuple[BlockVerdict, ...]:
     explain it for as many independent epochs. Where it may, as for an error that hardly changes and so counts once, it
     is unclear. Height and heading are also tested separately: an average over three axes would hide a wrong one.
     """
+    if (known := _JUDGED.get(errors)) is not None:
+        return known
     p, v, rph = scale_by_sigmas(errors)
     nees_p = errors.nees_p
     if not np.isfinite(nees_p).any():  # a covariance that is not invertible still has sigmas
@@ -56,7 +62,8 @@ def judge_sigmas(errors: Errors) -> tuple[BlockVerdict, ...]:
         level = np.sum(z[:, :2] ** 2, axis=1)
         rest = _judge(block, level, 2, z[:, :2]).verdict if np.isfinite(level).any() else ""
         out += [replace(whole, rest=rest), _judge(PARTS[block], nees_part, 1, z[:, 2:])]
-    return tuple(out)
+    _JUDGED[errors] = tuple(out)
+    return _JUDGED[errors]
 
 
 def select_verdict(verdicts: Sequence[BlockVerdict], verdict: str) -> list[BlockVerdict]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
+from graphnav.core.timescales import GPS_EPOCH
 from graphnav.gnss.files import count_days, take_whole_lines, unpack_bytes
 from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
 
@@ -153,8 +154,7 @@ def _parse_date(line: str) -> float:
     days, good = count_days(fields)
     if not good.all():
         raise ValueError
-    since = float((days - np.datetime64("1980-01-06", "D")).astype(np.int64)[0]) * 86400.0
-    return since + float(fields[0, 3:] @ np.array([3600.0, 60.0, 1.0]))
+    return float((days[0] - GPS_EPOCH) / np.timedelta64(1, "s")) + float(fields[0, 3:] @ np.array([3600.0, 60.0, 1.0]))
 
 
 def _parse_variation(line: str, begin: float, step: float) -> Array:

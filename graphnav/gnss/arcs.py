@@ -152,12 +152,16 @@ def _find_slips(
     # the clock may change by 1e5 m, at which the weights would lose all digits
     middle = np.array([np.median(one[some]) if some.any() else 0.0 for one, some in zip(y, w > 0.0, strict=True)])
     y = y - middle[:, None]
-    r = y
-    for _ in range(_REWEIGHTINGS):
-        weight = w / np.maximum(np.abs(r), _NOISE)
+
+    def fit(weight: Array) -> Array:
+        """Residuals of the least squares of each epoch."""
         N = np.einsum("esi,es,esj->eij", A, weight, A, optimize=True) + 1e-9 * np.eye(unknowns)
         x = np.linalg.solve(N, np.einsum("esi,es->ei", A, weight * y)[..., None])[..., 0]
-        r = y - np.einsum("esi,ei->es", A, x)
+        return np.asarray(y - np.einsum("esi,ei->es", A, x))
+
+    r = y
+    for _ in range(_REWEIGHTINGS):
+        r = fit(w / np.maximum(np.abs(r), _NOISE))
     limit = np.zeros(shape)
     limit[of, place] = 0.25 * wavelength[now[order]]
     far = (np.abs(r) > limit) & (w > 0.0)
@@ -178,9 +182,7 @@ def _find_slips(
     freedom = near.sum(axis=1) - unknowns
     # least squares over the rows that agree, whose residuals are no larger than those of the L1 solution
     weight = np.where(near, sigma**-2.0, 0.0)
-    N = np.einsum("esi,es,esj->eij", A, weight, A, optimize=True) + 1e-9 * np.eye(unknowns)
-    x = np.linalg.solve(N, np.einsum("esi,es->ei", A, weight * y)[..., None])[..., 0]
-    left = np.sum(weight * (y - np.einsum("esi,ei->es", A, x)) ** 2, axis=1)
+    left = np.sum(weight * fit(weight) ** 2, axis=1)
     told = (freedom >= _SPARE) & (left <= 2.0 * gammaincinv(0.5 * np.maximum(freedom, 1), 1.0 - _ALARM))
     told &= near.sum(axis=1) > far.sum(axis=1)  # L1 estimation has a breakdown point of one half
     every = far.any(axis=1) & ~told

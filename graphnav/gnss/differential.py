@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.gnss.arcs import find_arcs
@@ -96,7 +97,7 @@ def _draw_within_arcs(t: Array, at: Array, value: Array, arc: NDArray[np.intp]) 
     At an epoch of the base, to within the milliseconds between the clocks, its value is taken as it is.
     """
     right = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
-    nearest = np.where(np.abs(at[right - 1] - t) < np.abs(at[right] - t), right - 1, right)
+    nearest = pick_nearest(at, t)
     here = np.abs(at[nearest] - t) < _SAME_EPOCH
     between = (arc[right] == arc[right - 1]) & (at[right] - at[right - 1] <= _LONGEST_BASE_GAP)
     between &= (t >= at[right - 1]) & (t <= at[right])

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from graphnav.core import earth
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note, get_key
+from graphnav.core.interpolation import pick_nearest
+from graphnav.core.notes import Note, Notes, get_key
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import gps_to_utc
 from graphnav.gnss.antex import Antennas, read_antex
@@ -136,18 +137,16 @@ def load_raw(
             f"{sources.rover[0]}: no epoch has enough satellites for a position{left_out}", key="raw.few_satellites"
         )
     _check_agreement(raw.take(one), fixes, sources.rover[0])
-    notes = [*obs.remarks, *remarks]
+    notes = Notes([*obs.remarks, *remarks])
     if raw.klobuchar is None:
-        notes.append(
-            Note(
-                "raw.no_ionosphere",
-                "no ionosphere coefficients in the navigation files: the delay at night is assumed, 5 ns at the zenith",
-            )
+        notes.add(
+            "raw.no_ionosphere",
+            "no ionosphere coefficients in the navigation files: the delay at night is assumed, 5 ns at the zenith",
         )
     carriers = np.isfinite(raw.carrier)
     if half := int(np.sum(raw.half & carriers)):
         sentence = f"carriers that may be off by half a cycle: {half} of {int(carriers.sum())}; none of these is fixed"
-        notes.append(Note("raw.half_cycles", sentence))
+        notes.add("raw.half_cycles", sentence)
     raw, fixes = _correct_times(raw, fixes)
     if sources.base:
         raw, more = _difference_by_base(raw, sources, nav, precise)
@@ -226,9 +225,9 @@ def _difference_by_base(
         )
     base_fixes = solve(one)
     off, sigma = _measure_base(sources.base[0], one, base_fixes, position)
-    notes = [*obs.remarks, *contradictory]
+    notes = Notes([*obs.remarks, *contradictory])
     if given is None:
-        notes.append(Note("raw.base_position", "the base's position is that of its header"))
+        notes.add("raw.base_position", "the base's position is that of its header")
     base, _ = _correct_times(base, base_fixes)
     raw, others = add_differences(raw, base, position)
     raw = replace(raw, base_off=(tuple(off.tolist()), tuple(sigma.tolist())))
@@ -320,9 +319,8 @@ def _locate_roughly(obs: Observations, nav: Ephemerides | None, precise: Orbits 
 def _correct_times(raw: RawGnss, fixes: SinglePoint) -> tuple[RawGnss, SinglePoint]:
     """Series and solutions at the true times of reception: the receiver's stamps less its clock error."""
     epochs, of = raw.epochs
-    clock = _take_nearest(
-        epochs, fixes.t, fixes.clock
-    )  # not interpolated: a receiver's clock jumps by whole milliseconds
+    # not interpolated: a receiver's clock jumps by whole milliseconds
+    clock = _take_nearest(epochs, fixes.t, fixes.clock)
     drift = _take_nearest(epochs, fixes.t, fixes.drift) if np.isfinite(fixes.drift).any() else np.zeros(len(epochs))
     true = epochs - clock / C
     fixes = replace(fixes, t=true[np.searchsorted(epochs, fixes.t)])
@@ -336,6 +334,4 @@ def _correct_times(raw: RawGnss, fixes: SinglePoint) -> tuple[RawGnss, SinglePoi
 def _take_nearest(t: Array, known: Array, value: Array) -> Array:
     """(N,) at times t the value of the nearest known time."""
     known, value = known[np.isfinite(value)], value[np.isfinite(value)]
-    right = np.clip(np.searchsorted(known, t), 0, len(known) - 1)
-    left = np.maximum(right - 1, 0)
-    return np.asarray(np.where(np.abs(known[left] - t) < np.abs(known[right] - t), value[left], value[right]))
+    return np.asarray(value[pick_nearest(known, t)])

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Notes
 from graphnav.core.rotation import Array
 from graphnav.gnss.channels import find_channels
 from graphnav.gnss.ephemeris import Ephemerides, Placed, rotate_earth
@@ -65,7 +65,7 @@ def place(
         delay = nav.compute_delay(obs.satellite, obs.signal, frequency, obs.t, obs.zero)
     clock = np.where(np.isfinite(placed.clock), 0.0, np.nan) if corrected.clock else C * (placed.clock - delay)
     clock[np.isnan(frequency)] = np.nan  # needed for the ionospheric delay
-    remarks = [*(nav.remarks if nav is not None else ()), *(precise.remarks if precise is not None else ())]
+    remarks = Notes([*(nav.remarks if nav is not None else ()), *(precise.remarks if precise is not None else ())])
     lost = {int(s) for s in np.unique(obs.satellite[told[np.isnan(placed.p[told, 0])]])}
     lost_all = sorted(s for s in lost if not np.isfinite(placed.p[(obs.satellite == s), 0]).any())
     ill = sorted(set(lost_all) & (nav.unhealthy if nav is not None and precise is None else set()))
@@ -73,24 +73,24 @@ def place(
     mute = sorted({int(x) for x in np.unique(obs.satellite[np.isnan(frequency)])} - lost)
     if found_channels:
         names = ", ".join(f"{name_satellite(one)} {channel}" for one, channel in found_channels.items())
-        remarks.append(Note("raw.channels_found", f"GLONASS channels by the change of codes with carriers: {names}"))
+        remarks.add("raw.channels_found", f"GLONASS channels by the change of codes with carriers: {names}")
     if mute:
         names = ", ".join(name_satellite(x) for x in mute)
         sentence = (
             f"no frequency channel for {names}: their observations are not used; a GLONASS navigation file has it"
         )
-        remarks.append(Note("raw.no_channel", sentence))
+        remarks.add("raw.no_channel", sentence)
     if without:
         names = ", ".join(name_satellite(s) for s in without)
-        remarks.append(Note("raw.no_ephemeris", f"no ephemeris for {names}: their observations are not used"))
+        remarks.add("raw.no_ephemeris", f"no ephemeris for {names}: their observations are not used")
     if ill:
         names = ", ".join(name_satellite(s) for s in ill)
-        remarks.append(Note("raw.unhealthy", f"marked unhealthy in the navigation data, not used: {names}"))
+        remarks.add("raw.unhealthy", f"marked unhealthy in the navigation data, not used: {names}")
     partly = sorted(lost - set(lost_all))
     if partly:
         names = ", ".join(name_satellite(s) for s in partly)
         sentence = f"no ephemeris close enough in time for some observations of {names}"
-        remarks.append(Note("raw.no_ephemeris_then", sentence))
+        remarks.add("raw.no_ephemeris_then", sentence)
     raw = RawGnss(
         t=obs.t, satellite=obs.satellite, signal=obs.signal, code=obs.code, carrier=obs.carrier,
         range_rate=-obs.doppler * C / frequency, cn0=obs.cn0, slip=obs.slip, half=obs.half, frequency=frequency,

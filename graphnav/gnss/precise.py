@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import utc_to_gps
+from graphnav.core.timescales import GPS_EPOCH, count_leap_seconds
 from graphnav.gnss.ephemeris import Placed, rotate_earth
 from graphnav.gnss.files import Lines, count_days, parse_numbers, take_whole_lines, unpack_bytes
 from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
@@ -136,7 +136,7 @@ def _read_sp3(path: Path, remarks: list[str]) -> tuple[Array, Ids, Array, Array]
     own = np.flatnonzero(first == ord("P"))
     if not len(epoch) or not len(own):
         raise RecordingError(f"{path}: holds no positions", key="raw.no_positions")
-    t = _read_stamps(lines, epoch, 3, scale, path)
+    t = _read_stamps(lines, epoch, scale, path)
     try:
         value = parse_numbers(lines.take_block(own, 4, 60), 14)
         names = [bytes(x).decode() for x in lines.take_block(own, 1, 4)]
@@ -198,9 +198,9 @@ def _find_id(name: str) -> int:
     return number_satellite(name if name[0] != " " else "G" + name[1:])
 
 
-def _read_stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path: Path) -> Array:
-    """(n,) s since the GPS epoch, from lines with a date at a given column."""
-    words = [lines.get_text(k)[begin:].split()[:6] for k in which]
+def _read_stamps(lines: Lines, which: NDArray[np.intp], scale: str, path: Path) -> Array:
+    """(n,) s since the GPS epoch, from lines of a sign, a space and a date."""
+    words = [lines.get_text(k)[3:].split()[:6] for k in which]
     try:
         return _read_dates(np.array(words, dtype=float), scale)
     except ValueError:
@@ -222,11 +222,10 @@ def _read_dates(fields: Array, scale: str) -> Array:
     days, good = count_days(fields)
     if not good.all():
         raise ValueError
-    since = (days - np.datetime64("1980-01-06", "D")).astype(np.int64) * 86400.0
-    if scale in ("UTC", "GLO"):
-        since = utc_to_gps(days.astype("datetime64[us]"))
-    ahead = {"BDT": 14.0, "TAI": -19.0}.get(scale, 0.0)
-    return np.asarray(since + fields[:, 3:] @ np.array([3600.0, 60.0, 1.0]) + ahead)
+    ahead = count_leap_seconds(days) if scale in ("UTC", "GLO") else {"BDT": 14.0, "TAI": -19.0}.get(scale, 0.0)
+    return np.asarray(
+        (days - GPS_EPOCH) / np.timedelta64(1, "s") + fields[:, 3:] @ np.array([3600.0, 60.0, 1.0]) + ahead
+    )
 
 
 def _interpolate_orbit(nodes: tuple[Array, Array], t: Array, zero: float) -> Array:

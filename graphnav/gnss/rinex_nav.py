@@ -13,8 +13,8 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
-from graphnav.core.notes import Note, format_count
-from graphnav.core.timescales import WEEK, utc_to_gps
+from graphnav.core.notes import Notes, format_count
+from graphnav.core.timescales import GPS_EPOCH, WEEK, count_leap_seconds
 from graphnav.gnss.ephemeris import Ephemerides, Glonass, Kepler
 from graphnav.gnss.files import count_days, note_cut, unpack_bytes
 from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SBAS, SYSTEMS
@@ -25,7 +25,6 @@ _RECORD_LINES = {GLONASS: 4, SBAS: 4}  # lines of a record by system; 8 for all 
 _KNOWN_MESSAGES = {"LNAV", "INAV", "FNAV", "D1", "D2", "FDMA"}
 _ROOTS = (2530.0, 8192.0)  # sqrt(m), of the semi-major axis: the range that IS-GPS-200N, table 20-III, gives it
 _WEEKS = 6262  # of the GPS until 2100
-_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 
 
 @dataclass
@@ -46,7 +45,7 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
         If one is no RINEX navigation file, or none of them holds an ephemeris.
     """
     found = _Navigation()
-    remarks: list[str] = []
+    remarks = Notes()
     for path in paths:
         found.broken, found.skipped = [], {}
         remarks += _read(path, found)
@@ -54,10 +53,10 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
             sentence = (
                 f"{format_count(len(found.broken), 'unreadable record')} left out (the first at line {found.broken[0]})"
             )
-            remarks.append(Note("raw.broken_records", f"{path.name}: {sentence}"))
+            remarks.add("raw.broken_records", f"{path.name}: {sentence}")
         if found.skipped:
             names = ", ".join(f"{n} {name}" for name, n in sorted(found.skipped.items()))
-            remarks.append(Note("raw.unused_messages", f"{path.name}: messages that are not used: {names}"))
+            remarks.add("raw.unused_messages", f"{path.name}: messages that are not used: {names}")
     if not found.kepler and not found.glonass:
         raise RecordingError(f"{', '.join(str(p) for p in paths)}: no ephemeris in it", key="raw.no_ephemerides")
     coefficients = None
@@ -164,11 +163,11 @@ def _parse_date(text: str, short: bool) -> np.datetime64:
 
 def _add(found: _Navigation, system: int, number: int, date: np.datetime64, v: list[float], message: str) -> None:
     satellite = 100 * system + number
-    clock = float((date - _EPOCH) / np.timedelta64(1, "us")) * 1e-6
+    clock = float((date - GPS_EPOCH) / np.timedelta64(1, "us")) * 1e-6
     if system in (GLONASS, SBAS):
         if system == SBAS:
             return
-        ahead = float(utc_to_gps(np.array([date]))[0]) - clock
+        ahead = float(count_leap_seconds(np.array([date]))[0])
         p, u, a = (np.array([v[3 + i], v[7 + i], v[11 + i]]) * 1e3 for i in range(3))
         if not np.isfinite([*p, *u, *a, v[0], v[1]]).all():
             raise ValueError

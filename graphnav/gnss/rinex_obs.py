@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import WEEK, utc_to_gps
+from graphnav.core.timescales import GPS_EPOCH, WEEK, count_leap_seconds
 from graphnav.gnss.files import Lines, count_days, find_moved_points, note_cut, parse_numbers, unpack_bytes
 from graphnav.gnss.rinex_header import Header, check_types_stay, read_rinex_header
 from graphnav.gnss.series import Observations, drop_repeated
@@ -72,7 +72,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
     lines = Lines(data)
     header = read_rinex_header(lines, path)
     check_types_stay(data, lines, header, path)
-    remarks: list[str] = []
+    remarks = Notes()
     stamp, zero, flag, rows, cells = (_read_version_2 if header.version < 3.0 else _read_version_3)(
         lines, header, path, remarks
     )
@@ -118,10 +118,10 @@ def parse_observations(data: bytes, path: Path) -> Observations:
         raise RecordingError(f"{path}: no code or carrier of a known signal", key="rinex.no_signal")
     if bare := sorted({SYSTEMS[one] for one in np.unique(rows.satellite // 100) if not header.types.get(int(one))}):
         sentence = f"observations of {', '.join(bare)} left out: the header names no types of theirs"
-        remarks.append(Note("raw.no_types", f"{path.name}: {sentence}"))
+        remarks.add("raw.no_types", f"{path.name}: {sentence}")
     if unknown:
         names = ", ".join(sorted(unknown))
-        remarks.append(Note("raw.unknown_signals", f"{path.name}: signals not known are left out: {names}"))
+        remarks.add("raw.unknown_signals", f"{path.name}: signals not known are left out: {names}")
     t, satellite, signal_of, code, carrier, doppler, cn0, slip, half = (
         np.concatenate(x) for x in zip(*parts, strict=True)
     )
@@ -163,16 +163,16 @@ def _count_since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tup
     """
     days, good = count_days(fields)
     hour, minute, second = np.where(good[:, None], fields, 0.0).T[3:]
-    since = (days - np.datetime64("1980-01-06", "D")).astype(np.int64)
+    since = (days - GPS_EPOCH.astype("M8[D]")).astype(np.int64)
     week = int(since[used][0]) // 7
     ahead = 0.0
     if scale in ("GLO", "UTC"):
-        ahead = float(utc_to_gps(days[used][:1].astype("datetime64[us]"))[0]) - 86400.0 * float(since[used][0])
+        ahead = float(count_leap_seconds(days[used][:1])[0])
     ahead += 14.0 if scale == "BDT" else 0.0
     return (since - 7 * week) * 86400.0 + hour * 3600.0 + minute * 60.0 + second + ahead, week * WEEK
 
 
-def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
+def _read_version_3(lines: Lines, header: Header, path: Path, remarks: Notes) -> _Body:
     first = lines.list_first_bytes()
     first[: header.end] = 0
     epoch = np.flatnonzero(first == ord(">"))
@@ -240,7 +240,7 @@ def _parse_calendar(lines: Lines, epoch: NDArray[np.intp], begin: int, year: int
     return np.concatenate(whole, axis=1).reshape(n, 6)
 
 
-def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
+def _read_version_2(lines: Lines, header: Header, path: Path, remarks: Notes) -> _Body:
     types = len(next(iter(header.types.values())))
     each = -(-types // 5)  # lines of a satellite
     epochs: list[int] = []
@@ -320,7 +320,7 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
 
 def _say_cut(
     epoch: NDArray[np.intp], of: NDArray[np.intp], flag: NDArray[np.intp], count: NDArray[np.intp], path: Path,
-    remarks: list[str],
+    remarks: Notes,
 ) -> None:  # fmt: skip
     """Remarks about epochs with fewer lines of satellites than they announce."""
     short = np.flatnonzero((np.bincount(of, minlength=len(epoch)) < count) & (flag <= 1))
@@ -329,7 +329,7 @@ def _say_cut(
     elif len(short):
         some, line = format_count(len(short), "epoch"), epoch[short[0]] + 1
         sentence = f"{some} with fewer satellites than announced, the first at line {line}"
-        remarks.append(Note("raw.short_epochs", f"{path.name}: {sentence}"))
+        remarks.add("raw.short_epochs", f"{path.name}: {sentence}")
 
 
 def _names_satellite(name: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -340,12 +340,12 @@ def _names_satellite(name: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.asarray((letter >= ord("A")) & (letter <= ord("Z")) & ten & digit)
 
 
-def _say_unknown(letters: list[str], path: Path, remarks: list[str]) -> None:
+def _say_unknown(letters: list[str], path: Path, remarks: Notes) -> None:
     """A remark about observations of satellites of systems that are not known, by their letters."""
     if letters:
         some = ", ".join(f"{letters.count(one)} of {one}" for one in sorted(set(letters)))
         sentence = f"observations of satellite systems not known are left out: {some} (known: {', '.join(SYSTEMS)})"
-        remarks.append(Note("raw.unknown_systems", f"{path.name}: {sentence}"))
+        remarks.add("raw.unknown_systems", f"{path.name}: {sentence}")
 
 
 def _refuse_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2) -> RecordingError:

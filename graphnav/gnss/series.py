@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Note, Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.gnss.antex import Antennas
 from graphnav.gnss.signals import SYSTEM_NAMES, C, Ids, find_frequencies, name_signal
@@ -124,13 +124,13 @@ def drop_repeated(obs: Observations) -> Observations:
             "they are of two receivers; name the files of one in rover, that of a base station in base",
             key="raw.two_receivers",
         )
-    remarks = list(obs.remarks)
+    remarks = Notes(obs.remarks)
     if same := int(np.sum(~other)):
         sentence = f"{format_count(same, 'repeated observation')} left out; the first of each is used"
-        remarks.append(Note("raw.twice", sentence))
+        remarks.add("raw.twice", sentence)
     if len(differ):
         sentence = f"{format_count(len(differ), 'observation')} left out: there twice, with other values"
-        remarks.append(Note("raw.twice_unlike", sentence))
+        remarks.add("raw.twice_unlike", sentence)
     return replace(obs.take(np.delete(first, differ)), remarks=tuple(remarks))
 
 
@@ -140,10 +140,11 @@ def drop_contradictory(raw: RawGnss) -> tuple[RawGnss, tuple[str, ...]]:
     From epoch to epoch a carrier phase changes as the code does, and so does the integral of the range rate; the
     receiver's clock is in all of them. Remarks say what was dropped.
     """
-    name, notes = PurePath(raw.files[0]).name if raw.files else "rover", []
+    name, notes = PurePath(raw.files[0]).name if raw.files else "rover", Notes()
     if 0.0 <= (strongest := float(np.max(raw.cn0, initial=-np.inf, where=np.isfinite(raw.cn0)))) < _LEAST_TRACKED:
         sentence = f"{name}: signal strengths are no C/N0 in dB-Hz, the largest is {strongest:g}: they are not used"
-        raw, notes = replace(raw, cn0=np.full(len(raw), np.nan)), [Note("raw.strength_unit", sentence)]
+        raw = replace(raw, cn0=np.full(len(raw), np.nan))
+        notes.add("raw.strength_unit", sentence)
     order = np.lexsort((raw.t, raw.signal, raw.satellite))
     now, before = order[1:], order[:-1]
     dt = raw.t[now] - raw.t[before]
@@ -170,7 +171,7 @@ def drop_contradictory(raw: RawGnss) -> tuple[RawGnss, tuple[str, ...]]:
                 f"{', '.join(wrong)}; they are not used"
             )
             raw = replace(raw, **{column: value})
-            notes.append(Note("raw.unlike_codes", sentence))
+            notes.add("raw.unlike_codes", sentence)
     return raw, tuple(notes)
 
 

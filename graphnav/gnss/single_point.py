@@ -59,7 +59,6 @@ class SinglePoint:
     t: Array  # (E,) s, stamps of the rows
     p: Array  # (E, 3) m in e
     clock: Array  # (E,) m
-    biases: Array  # (E, G) m, bias of each group of signals relative to the first; NaN without satellites
     covariance: Array  # (E, 3, 3) m^2 in east, north, up, by the stated sigmas
     v: Array  # (E, 3) m/s in e
     drift: Array  # (E,) m/s
@@ -189,11 +188,9 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True, dif
     found &= (rms < _LOST_RMS) & (np.trace(cofactor, axis1=-2, axis2=-1) < _WORST_PDOP**2)
     x[~found] = np.nan
     cofactor[~found] = np.nan
-    biases = np.where(present, np.concatenate([np.zeros((E, 1)), x[:, 4:]], axis=1), np.nan)
-    clock = np.where(present[:, 0], x[:, 3], x[:, 3])
     v, drift, covariance_v = _solve_velocities(raw, of, place, (E, S), x, mask, robust)
     return SinglePoint(
-        t, x[:, :3], clock, biases, cofactor, v, drift, covariance_v, counted.astype(np.intp), rms, groups, group,
+        t, x[:, :3], x[:, 3], cofactor, v, drift, covariance_v, counted.astype(np.intp), rms, groups, group,
         np.where(used, r, np.nan), np.where(used, weight, 0.0),
     )  # fmt: skip
 

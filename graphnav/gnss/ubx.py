@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.timescales import WEEK
 from graphnav.gnss.ephemeris import Ephemerides
 from graphnav.gnss.files import note_cut
@@ -70,9 +70,9 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
         raise RecordingError(
             f"{path}: no RXM-RAWX messages{whole}; switch them on in the receiver", key="raw.no_messages"
         )
-    remarks = []
+    remarks = Notes()
     if found.broken:
-        remarks.append(Note("raw.broken_records", f"{path.name}: {format_count(found.broken, 'broken frame')} skipped"))
+        remarks.add("raw.broken_records", f"{path.name}: {format_count(found.broken, 'broken frame')} skipped")
     if found.cut:
         remarks.append(note_cut(path.name, "message"))
     week0 = found.times[0][1]
@@ -88,7 +88,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     known = (signal >= 0) & (system >= 0) & (number > 0) & (number < 100)  # 255: a satellite of GLONASS not known yet
     if not known.all():
         sentence = f"{format_count((~known).sum(), 'measurement')} of unknown signals or satellites left out"
-        remarks.append(Note("raw.unknown_signals", f"{path.name}: {sentence}"))
+        remarks.add("raw.unknown_signals", f"{path.name}: {sentence}")
     satellite = (100 * system + number).astype(np.int16)
     status, lock = rows["status"], rows["lock"] * 1e-3
     has_carrier = (status & _CARRIER_BIT > 0) & (rows["carrier"] != 0.0)

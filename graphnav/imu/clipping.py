@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.imu.samples import Samples
 from graphnav.recording import Imu
@@ -113,7 +113,7 @@ def restore_peaks(samples: Samples, R_bs: Array, known: Array | None = None) -> 
     R_bs : body from the sensors' own axes.
     known : as `highest` says, what they have read at other times.
     """
-    notes = []
+    notes = Notes()
     out = samples
     for k, (name, what, unit) in enumerate((("gyro", "gyro", "rad/s"), ("accel", "accelerometer", "m/s^2"))):
         x, cut = getattr(samples, name) @ R_bs, False
@@ -130,12 +130,10 @@ def restore_peaks(samples: Samples, R_bs: Array, known: Array | None = None) -> 
                 added = float(np.sum((p.values - x[rows, axis]) * T))
                 extra[rows] += (_RESTORED_SIGMA * added) ** 2 / T.sum()
                 x[rows, axis] = p.values
-            notes.append(
-                Note(
-                    "imu.clipped",
-                    f"{what} {'xyz'[axis]} (file axes) is clipped at {limit:.3g} {unit}: "
-                    f"{format_count(len(peaks), 'peak')} restored from the flanks",
-                )
+            notes.add(
+                "imu.clipped",
+                f"{what} {'xyz'[axis]} (file axes) is clipped at {limit:.3g} {unit}: "
+                f"{format_count(len(peaks), 'peak')} restored from the flanks",
             )
         if cut:
             x = x @ R_bs.T

@@ -147,15 +147,17 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array, par
     n = len(t) - 1
     ba, bg = np.broadcast_to(ba, (n, 3)), np.broadcast_to(bg, (n, 3))
     pieces = cut_pieces(samples, t)
-    parts: list[tuple[Array, Intervals]] = []
+    out: dict[str, Array] = {}
     for rows in group_intervals(pieces.count):
         dt, index = pieces.pad(rows)
-        parts.append((rows, _integrate(samples, imu, t, rows, dt, index, ba[rows], bg[rows], parts_of_noise)))
-    if n == 1:
-        return parts[0][1]
-    order = np.argsort(np.concatenate([rows for rows, _ in parts]), kind="stable")
-    names = Intervals.__dataclass_fields__
-    return Intervals(*(np.concatenate([getattr(part, name) for _, part in parts])[order] for name in names))
+        part = _integrate(samples, imu, t, rows, dt, index, ba[rows], bg[rows], parts_of_noise)
+        if n == 1:
+            return part
+        for name, x in vars(part).items():
+            if name not in out:
+                out[name] = np.empty((n, *x.shape[1:]))
+            out[name][rows] = x
+    return Intervals(**out)
 
 
 def preintegrate_unknown(

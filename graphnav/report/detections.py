@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
-from graphnav.estimation.stops import Stop, format_detections, list_stops
+from graphnav.estimation.stops import format_detections, list_stops
 from graphnav.recording import Recording
 from graphnav.recording.exporters.digits import format_rows
 from graphnav.report import page
@@ -37,12 +38,7 @@ def write_detections(recording: Recording, found: Detections, folder: Path) -> l
 def _make_page(recording: Recording, found: Detections) -> str:
     spans = found.stationary - recording.start
     rows = [
-        [
-            Quantity(f"{a:.2f} s"),
-            Quantity(f"{b:.2f} s"),
-            Quantity(f"{b - a:.2f} s"),
-            format_fired(stop),
-        ]
+        [*(Quantity(f"{seconds:.2f} s") for seconds in (a, b, b - a)), stop.format_fired()]
         for (a, b), stop in zip(spans, list_stops(found.all), strict=True)
     ]
     lead = [page.paragraph(line) for line in _list_figures(recording, found)]
@@ -52,11 +48,6 @@ def _make_page(recording: Recording, found: Detections) -> str:
         ("Notes", [page.bullets(found.notes)] if found.notes else []),
     ]
     return page.make_page(f"{recording.name}: detectors", lead, sections)
-
-
-def format_fired(stop: Stop) -> str:
-    """The detectors that found a stop, and the share that each found."""
-    return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items())
 
 
 def format_statistics(found: Detections) -> str:
@@ -80,8 +71,7 @@ def _find_nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
     """Row of `of` nearest to each time, and whether it is within half of its own spacing."""
     if len(of) == 1:
         return np.zeros(len(t), dtype=int), np.abs(t - of[0]) < 1.0
-    k = np.clip(np.searchsorted(of, t), 1, len(of) - 1)
-    k = k - (t - of[k - 1] < of[k] - t)
+    k = pick_nearest(of, t)
     return k, np.abs(of[k] - t) <= 0.51 * float(np.median(np.diff(of))) + 1e-6
 
 

@@ -15,11 +15,8 @@ from graphnav.core.timescales import GPS_TO_UNIX, gps_to_utc
 from graphnav.estimation.names import has_names, name_rows
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
-from graphnav.report import page
-from graphnav.report import pictures as pictures
+from graphnav.report import page, pictures, summary, tables
 from graphnav.report import sentences as words
-from graphnav.report import summary as summary
-from graphnav.report import tables as tables
 from graphnav.report.beside import has_place
 from graphnav.report.doubts import list_doubts
 from graphnav.report.plots import PALETTE, Shades, Tinted
@@ -77,14 +74,7 @@ def write_report(
         solution = replace(solution, separation=None)
     own, others = ({k: p for k, p in solution.parameters.items() if has_names(k) == of_it} for of_it in (True, False))
     sections: Sections = [
-        (
-            "Trajectory",
-            [
-                page.gallery([pictures.draw_trajectory(recording, only, spans)]),
-                page.gallery([pictures.draw_profile(recording, only)]),
-                *_make_gallery(pictures.draw_motion(recording, only, spans)),
-            ],
-        ),
+        ("Trajectory", _draw_paths(recording, only, spans)),
         (
             "Accuracy",
             [
@@ -190,7 +180,7 @@ def write_comparison(
     every, metrics_of = errors or {}, metrics or {}
     first = next(iter(solutions.values()))
     spans = _list_shades(first, start, withheld, outages)
-    gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
+    gone = tables.list_removed_spans(withheld)
     zooms = pictures.zoom_pictures(every, start, gone)
     if not gone:
         zooms = pictures.zoom_pictures(every, start, outages, "no GNSS")
@@ -216,14 +206,7 @@ def write_comparison(
             ],
         ),
         ("Spans without GNSS" if not gone else "Withheld spans", _make_gallery(zooms)),
-        (
-            "Trajectory",
-            [
-                page.gallery([pictures.draw_trajectory(recording, solutions, spans)]),
-                page.gallery([pictures.draw_profile(recording, solutions)]),
-                *_make_gallery(pictures.draw_motion(recording, solutions, spans)),
-            ],
-        ),
+        ("Trajectory", _draw_paths(recording, solutions, spans)),
         ("Errors against truth", _make_gallery(pictures.draw_errors(every, start, end, spans))),
         ("Differences between solvers", _make_gallery(pictures.draw_differences(solutions, start, end, spans))),
         ("Consistency of sigma", _draw_consistency(every, start, end, spans)),
@@ -271,7 +254,7 @@ def _list_clocks(recording: Recording) -> list[page.TimeAxis]:
 def _list_shades(solution: Solution, start: float, withheld: Removed, outages: Tinted) -> Shades:
     """Spans of time to be tinted, s from the start, by kind."""
     excluded = [(part.t_start - start, part.t_end - start) for part in solution.excluded]
-    gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
+    gone = tables.list_removed_spans(withheld)
     return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
 
 
@@ -290,6 +273,12 @@ def _describe_verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, E
     # without truth, a filter's innovations test the common model better than any residuals
     filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
     return [words.describe_sigma_without_truth(solution) for solution in filters or solutions.values()]
+
+
+def _draw_paths(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> list[Markup]:
+    """Plan view, heights, and motion over time."""
+    each = pictures.draw_trajectory(recording, solutions, spans), pictures.draw_profile(recording, solutions)
+    return [*(page.gallery([one]) for one in each), *_make_gallery(pictures.draw_motion(recording, solutions, spans))]
 
 
 def _draw_consistency(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.estimation.names import name_rows
@@ -212,7 +213,7 @@ def _find_rows(t: Array, of: Array | None) -> np.ndarray:
     """Row of `of` at each time, -1 where there is none within a millisecond."""
     if of is None or not len(of):
         return np.full(len(t), -1)
-    k = np.clip(np.searchsorted(of, t - 1e-3), 0, len(of) - 1)
+    k = pick_nearest(of, t)
     return np.where(np.abs(of[k] - t) <= 1e-3, k, -1)
 
 

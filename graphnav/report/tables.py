@@ -31,6 +31,11 @@ _UNFOLDED_ROWS = 10  # excluded spans and stops shown; the others are folded
 Removed = Sequence[tuple[str, tuple[float, float] | None]]
 
 
+def list_removed_spans(withheld: Removed) -> list[tuple[float, float]]:
+    """The spans in which a source was withheld, each once."""
+    return list(dict.fromkeys(span for _, span in withheld if span is not None))
+
+
 def tabulate_constraints(solution: Solution) -> list[Markup]:
     """Counts of everything used, and the consistency of each record."""
     out = []
@@ -103,7 +108,7 @@ def tabulate_all_accuracy(
         return []
     rows = [[page.format_solver(name), *tabulate_accuracy(e)] for name, e in errors.items()]
     out = [page.heading("Whole recording"), page.make_table(["solver", *COMPARED], rows, best=range(1, 7))]
-    gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
+    gone = list_removed_spans(withheld)
     spans = [("Withheld", span) for span in gone]
     spans += [("No GNSS", (a, b)) for a, b in outages if not any(c < b and d > a for c, d in gone)]
     if len(errors) == 1 and spans:
@@ -326,7 +331,7 @@ def tabulate_stops(solution: Solution, start: float, decided_by: str) -> list[Ma
         [
             Quantity(f"{stop.start - start:.2f} s"),
             Quantity(f"{stop.end - stop.start:.2f} s"),
-            ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items()),
+            stop.format_fired(),
             ", ".join(f"{count} {name_rows(name)}" for name, count in stop.rows.items()) or "none",
         ]
         for stop in stops[:_MAX_ROWS]

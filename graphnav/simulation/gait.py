@@ -117,7 +117,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     t = list_centres(0.0, end, GAIT_STEP, GAIT_DEGREE)
     strike, off = steps.strike, steps.off
     vary = 1.0 + style.jitter * rng.standard_normal((K, 11))
-    sway = np.deg2rad(0.03) * _draw_sway(len(t), rng, 2)
+    sway = np.deg2rad(0.03) * _draw_sway(len(t), rng)
     # a first and a last stance begin and end as the others do
     typical = float(np.median(off[1:-1] - strike[1:-1]))
     begins = np.where(np.arange(K) == 0, off - typical, strike)
@@ -233,7 +233,7 @@ def _make_ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator)
     return out
 
 
-def _draw_sway(count: int, rng: np.random.Generator, columns: int) -> Array:
-    """(count, columns) of unit size: the sway of a standing person."""
-    x = gaussian_filter1d(rng.standard_normal((count, columns)), 0.3 / GAIT_STEP, axis=0)
+def _draw_sway(count: int, rng: np.random.Generator) -> Array:
+    """(count, 2) of unit size: the sway of a standing person."""
+    x = gaussian_filter1d(rng.standard_normal((count, 2)), 0.3 / GAIT_STEP, axis=0)
     return x / np.sqrt(np.mean(x**2, axis=0))

@@ -21,13 +21,12 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array, mv
-from graphnav.core.trajectory import Trajectory
-from graphnav.recording import Imu, Recording, Truth
+from graphnav.recording import Recording
 from graphnav.recording.formats.writing import round_recording
 from graphnav.simulation.gait import GAIT_STEP, HEADING, PITCH, PLACE_CHANNELS, ROLL, Foot
 from graphnav.simulation.inertial import SimulatedImu
 from graphnav.simulation.kinematics import TrueMotion
-from graphnav.simulation.result import Simulated
+from graphnav.simulation.result import Simulated, read_motion
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(3)
 _SAMPLES_AT_ONCE = 1 << 13  # samples at a time
@@ -114,22 +113,8 @@ def record_walk(
     figures.
     """
     motion = move_foot(foot, origin, rotation.from_rph(np.deg2rad(mounting)), imu.rate, compensated)
-    gyro, accel = motion.gyro, motion.accel
-    b_g, b_a = np.zeros_like(gyro), np.zeros_like(accel)
-    if not exact:
-        gyro, accel, b_g, b_a = imu.read(gyro, accel, seed)
-    rph = motion.rph
-    every = slice(None, None, max(1, round(imu.rate / 100.0)))
-    recording = Recording(
-        name=f"{name} (simulated, seed {seed})",
-        platform="foot",
-        imu=Imu(motion.t[1:], gyro, accel, imu.noise),
-        truth=Truth(motion.t[every], motion.llh[every], None, motion.v[every], rph[every]),
-    )
-    truth = Trajectory(
-        motion.t, motion.llh, motion.v, rph, name="truth",
-        gyro_bias=np.vstack([b_g[:1], b_g]), accel_bias=np.vstack([b_a[:1], b_a]),
-    )  # fmt: skip
+    readings, sampled, truth = read_motion(motion, imu, seed, exact, 100.0)
+    recording = Recording(f"{name} (simulated, seed {seed})", "foot", readings, truth=sampled)
     known: dict[str, Any] = {"scenario": name, "seed": seed, "imu": imu.name, **(facts or {})}
     known["mounting_deg"] = dict(zip(("roll", "pitch", "heading"), mounting, strict=True))
     known["clipped_samples"] = {

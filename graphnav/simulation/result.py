@@ -64,6 +64,23 @@ class Simulated:
         return [*files, write_facts(FilePath(folder) / "simulated.json", facts)]
 
 
+def read_motion(
+    motion: TrueMotion, imu: SimulatedImu, seed: int, exact: bool, truth_rate: float
+) -> tuple[Imu, Truth, Trajectory]:
+    """An IMU's readings, without its errors if `exact`, the truth at a rate (Hz), and all of it with the biases."""
+    gyro, accel = motion.gyro, motion.accel
+    b_g, b_a = np.zeros_like(gyro), np.zeros_like(accel)
+    if not exact:
+        gyro, accel, b_g, b_a = imu.read(gyro, accel, seed)
+    rph, every = motion.rph, slice(None, None, max(1, round(imu.rate / truth_rate)))
+    whole = Trajectory(
+        motion.t, motion.llh, motion.v, rph, name="truth",
+        gyro_bias=np.vstack([b_g[:1], b_g]), accel_bias=np.vstack([b_a[:1], b_a]),
+    )  # fmt: skip
+    sampled = Truth(motion.t[every], motion.llh[every], None, motion.v[every], rph[every])
+    return Imu(motion.t[1:], gyro, accel, imu.noise), sampled, whole
+
+
 def record(
     name: str,
     seed: int,
@@ -83,12 +100,7 @@ def record(
 ) -> Simulated:
     """Drive `path` and read the sensors. `exact` omits the IMU's errors and keeps its stated figures."""
     motion = move_vehicle(path, origin, mount, shake, imu.rate)
-    gyro, accel = motion.gyro, motion.accel
-    b_g, b_a = np.zeros_like(gyro), np.zeros_like(accel)
-    if not exact:
-        gyro, accel, b_g, b_a = imu.read(gyro, accel, seed)
-    rph = motion.rph
-    every = slice(None, None, max(1, round(imu.rate / truth_rate)))
+    readings, sampled, truth = read_motion(motion, imu, seed, exact, truth_rate)
     known: dict[str, Any] = {"scenario": name, "seed": seed, "imu": imu.name, **(facts or {})}
     known["mounting_deg"] = {"roll": mount.angles[0], "pitch": mount.angles[1], "heading": mount.angles[2]}
     wheels = None
@@ -104,14 +116,10 @@ def record(
     recording = Recording(
         name=f"{name} (simulated, seed {seed})",
         platform="vehicle",
-        imu=Imu(motion.t[1:], gyro, accel, imu.noise),
+        imu=readings,
         gnss=None if gnss is None else gnss.read(motion, seed),
         odometer=wheels,
-        truth=Truth(motion.t[every], motion.llh[every], None, motion.v[every], rph[every]),
+        truth=sampled,
         sensors=sensors,
     )
-    truth = Trajectory(
-        motion.t, motion.llh, motion.v, rph, name="truth",
-        gyro_bias=np.vstack([b_g[:1], b_g]), accel_bias=np.vstack([b_a[:1], b_a]),
-    )  # fmt: skip
     return Simulated(round_recording(recording), truth, path.find_stops(), known, motion)

@@ -14,12 +14,13 @@ from mistakes import ROOT
 
 from graphnav import run
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Notes
 from graphnav.estimation.solution import make_trajectory
 from graphnav.evaluation.evaluate import evaluate_recording
 from graphnav.recording import Recording, take_rows
 from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import read
-from graphnav.recording.formats.repair import Remarks, choose_sigmas
+from graphnav.recording.formats.repair import choose_sigmas
 from graphnav.recording.formats.table import Table
 from graphnav.recording.plausibility.fixes import find_out_of_reach
 from graphnav.recording.plausibility.screening import screen, screen_recording
@@ -406,7 +407,7 @@ def table(tmp_path: Path, *sd: float) -> Table:
     ],
 )
 def test_a_sigma_printed_as_zero_is_floored_and_said(tmp_path: Path, sd: tuple[float, ...], floor: float) -> None:
-    rows, remarks = table(tmp_path, *sd), Remarks()
+    rows, remarks = table(tmp_path, *sd), Notes()
     every = np.ones(len(sd), dtype=bool)
     got = choose_sigmas(rows, ("sd_e", "sd_n", "sd_u"), None, (1.0, 1.0, 1.0), "GNSS position", every, remarks)
     np.testing.assert_allclose(got[0], floor)
@@ -419,7 +420,7 @@ def test_sigmas_that_are_all_zero_or_below_it_are_refused(tmp_path: Path, sd: tu
     every = np.ones(len(sd), dtype=bool)
     with refused("table.sigma", RecordingError):
         choose_sigmas(
-            table(tmp_path, *sd), ("sd_e", "sd_n", "sd_u"), None, (1.0, 1.0, 1.0), "GNSS position", every, Remarks()
+            table(tmp_path, *sd), ("sd_e", "sd_n", "sd_u"), None, (1.0, 1.0, 1.0), "GNSS position", every, Notes()
         )
 
 

@@ -47,6 +47,7 @@ MEDIANS = {
     "nees_p_inside_95": "share of the positions within their 95 % regions",
     "sd_h_median_m": "horizontal sigma (m)",
 }
+_MOST_LOST = 10  # failed drives listed
 _BADNESS = ("span_end_h_median_m", "h_rms_m", "sd_h_median_m")
 
 
@@ -130,7 +131,7 @@ def describe_unscored(rows: Sequence[FleetRow], withhold: float) -> str:
     return f"\nnothing withheld by --withhold {withhold:g} in {of}: no GNSS, or shorter than {least:g} s"
 
 
-def format_totals(rows: Sequence[FleetRow], most: int = 10) -> str:
+def format_totals(rows: Sequence[FleetRow]) -> str:
     """The totals, and the failed drives, for a terminal."""
     found = compute_totals(rows)
     lines = [describe_totals(found)]
@@ -138,5 +139,5 @@ def format_totals(rows: Sequence[FleetRow], most: int = 10) -> str:
         lines.append("medians of the drives:")
     lines += [f"  {MEDIANS[key]:<54}{value:10.4g}" for key, value in found["medians"].items()]
     lost = [row for row in rows if row["status"] != DONE]
-    lines += [f"  {row['drive']}: {row['status']}: {row.get('error')}" for row in lost[:most]]
-    return "\n".join([*lines, *([f"  and {len(lost) - most} more"] if len(lost) > most else [])])
+    lines += [f"  {row['drive']}: {row['status']}: {row.get('error')}" for row in lost[:_MOST_LOST]]
+    return "\n".join([*lines, *([f"  and {len(lost) - _MOST_LOST} more"] if len(lost) > _MOST_LOST else [])])

@@ -143,14 +143,6 @@ def regress_inliers(x: Array, y: Array) -> tuple[float, Array]:
     return _regress(x[keep], y[keep]) if keep.sum() >= MIN_PAIRS else (0.0, b)
 
 
-def _find_peak(lags: Array, c: Array) -> float:
-    """Position of the maximum of evenly spaced values, by the parabola through it and its neighbours."""
-    k = int(np.argmax(c))
-    if 0 < k < len(lags) - 1 and (curve := c[k - 1] - 2 * c[k] + c[k + 1]) < 0 and np.isfinite(curve):
-        return float(lags[k] + 0.5 * (c[k - 1] - c[k + 1]) / curve * (lags[1] - lags[0]))
-    return float(lags[k])
-
-
 def _search_shift(
     t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, valid: Callable[[float], Array]
 ) -> Fit:
@@ -174,13 +166,13 @@ def _search_shift(
     close = np.unique(np.clip(rough[:, None] + np.arange(-4, 5), 0, len(lags) - 1))
     c = np.full(len(lags), -np.inf)
     c[close] = correlate_all(few, lags[close])
-    near = _find_peak(lags, c)
+    near = lags_of_clocks.find_lowest(lags, -c)
     coarse, reached = near, correlate(near, few)
     # larger shifts only if no small one explains y, and only for a clearly better fit, for there are many of them
     reach = min(LARGEST_SHIFT, 0.3 * (span[-1] - span[0]))
     if reached < 0.6 and reach > _NEAR_CLOCKS:
         wide = np.arange(-reach, reach + 0.1, 0.2)
-        far = _find_peak(wide, correlate_all(few, wide))
+        far = lags_of_clocks.find_lowest(wide, -correlate_all(few, wide))
         if abs(far) > _NEAR_CLOCKS and correlate(far, few) > reached + 0.15:
             coarse = far
     lag, spread = lags_of_clocks.refine_lag(t, y, x_at, valid, many, coarse, MIN_PAIRS)

@@ -95,7 +95,7 @@ def refine_lag(
         return guess, LAG_REACH
     near = wide[int(np.nanargmin(seen))] + np.arange(-_COARSE, _COARSE + _FINE / 2, _FINE)
     close = compute_profile(near)
-    lag = _find_lowest(near, close)
+    lag = find_lowest(near, close)
     best = interpolate_at(lag, rows)
     scores = None if best is None else _score_lags(t, x_at, valid, best, lag)
     if best is None or scores is None:
@@ -185,7 +185,7 @@ def _score_lags(
     return max(lasting, scatter, 1e-300), information
 
 
-def _find_lowest(lags: Array, values: Array) -> float:
+def find_lowest(lags: Array, values: Array) -> float:
     """Position of the minimum of evenly spaced values, by the parabola through it and its neighbours."""
     k = int(np.nanargmin(values))
     if 0 < k < len(lags) - 1 and np.isfinite(values[k - 1 : k + 2]).all():

@@ -109,7 +109,6 @@ NAMED_UNITS = {
     "inhg": ("pressure", "inHg"),
     "ft": ("length", "ft"), "feet": ("length", "ft"), "foot": ("length", "ft"),
 }  # fmt: skip
-_AXIS_COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az")
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,15 @@ def format_rows(table: Array, row_format: str) -> str:
     return encode_rows(table, row_format).decode("ascii")
 
 
+def format_json_rows(table: Array, number_format: str, line: str) -> str:
+    """Numbers (K,) or (K, n) for `graphnav.core.jsonable`: several times as fast as all digits of each."""
+    rows = format_rows(np.reshape(table, (len(table), -1)), ", ".join([number_format] * np.size(table[0])))
+    if np.ndim(table) == 1:
+        return f"[{', '.join(rows.splitlines())}]"
+    between = f"],{line}  ["
+    return f"[{between[2:]}{between.join(rows.splitlines())}]{line}]"
+
+
 def encode_rows(table: Array, row_format: str, last: Array | None = None) -> bytes:
     """The same as ASCII bytes.
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Truth
 from graphnav.recording.formats import schema
@@ -19,7 +19,6 @@ from graphnav.recording.formats.repair import (
     DEFAULT_SD_V,
     VAGUEST,
     VAGUEST_V,
-    Remarks,
     blank_unknown,
     check_residuals,
     choose_sigmas,
@@ -34,7 +33,7 @@ _ROWS_AT_ONCE = 1 << 16  # rows at once
 _SD_V = ("sd_ve", "sd_vn", "sd_vu")
 
 
-def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
+def build_imu(d: schema.ImuTable, rows: Table, remarks: Notes) -> Imu:
     """Samples in body axes RFU, rad/s and m/s^2, with the stated noise figures, else a consumer IMU's."""
     R_bs = d.R_bs
     gyro = _take_in_body(rows, ("gx", "gy", "gz"), schema.RATE_UNITS[d.units.gyro], R_bs)
@@ -66,7 +65,7 @@ def _take_in_body(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array)
     return out
 
 
-def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
+def build_gnss(d: schema.GnssTable, rows: Table, remarks: Notes) -> Gnss:
     """Fixes (rad, m) with their sigmas, without those of useless precision; velocities where all axes are given."""
     rows, known = blank_unknown(rows)
     if not known.all():
@@ -147,7 +146,7 @@ def _fill(values: Array, rows: Table) -> Array:
     return np.asarray(np.interp(np.arange(len(values)), known, values[known]))
 
 
-def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:
+def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Notes) -> Odometer:
     """Speeds, m/s, from a speed, from several wheels, or from counted pulses."""
     t, scale = rows["t"], schema.SPEED[d.units.speed]
     used = d.list_readings(tuple(rows.columns))
@@ -198,7 +197,7 @@ def list_needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
     )
 
 
-def build_series(sensor: Sensor, d: Any, rows: Table, remarks: Remarks) -> Series:
+def build_series(sensor: Sensor, d: Any, rows: Table, remarks: Notes) -> Series:
     """Rows of a sensor of `graphnav.sensors` in SI units, without those that measure nothing."""
     absent = np.full(len(rows), np.nan)
     sizes = [column.units[getattr(d.units, column.name)] for column in sensor.columns]
@@ -213,7 +212,7 @@ def build_series(sensor: Sensor, d: Any, rows: Table, remarks: Remarks) -> Serie
     return Series(sensor, rows["t"][whole], values[whole], figures)
 
 
-def build_truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:
+def build_truth(d: schema.TruthTable, rows: Table, remarks: Notes) -> Truth:
     """Reference positions, and velocities (m/s) and angles (rad) where the file has them."""
     llh = xyz = None
     if d.frame == "local":

@@ -13,7 +13,7 @@ import numpy as np
 from graphnav.core.earth import ecef_to_llh, enu_axes
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import resolve_beside
-from graphnav.core.notes import get_key
+from graphnav.core.notes import Notes, get_key
 from graphnav.core.timescales import parse_clock
 from graphnav.gnss.series import RawGnss
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth
@@ -27,7 +27,7 @@ from graphnav.recording.formats.csv_sensors import (
     list_needed,
 )
 from graphnav.recording.formats.registry import Format, Log
-from graphnav.recording.formats.repair import Remarks, select_usable_rows
+from graphnav.recording.formats.repair import select_usable_rows
 from graphnav.recording.formats.table import Table, read_table
 from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.sensors import list_sensors
@@ -55,7 +55,7 @@ def read_folder(source: str | Path, allow_outside: bool = False) -> Recording:
     path = Path(source)
     path = path / "recording.toml" if path.is_dir() else path
     d = schema.read_description(path)
-    remarks = Remarks()
+    remarks = Notes()
     files = [path]
     logs: dict[str, Log | None] = {}  # by file; one log may contain several sensors
     zeros: list[float] = []  # zeros of their clocks
@@ -85,7 +85,7 @@ def read_folder(source: str | Path, allow_outside: bool = False) -> Recording:
             required = (*required, *list_needed(known[name], rows))
         return select_usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
 
-    def read_one(name: str, of_table: Callable[[Any, Table, Remarks], Any], of_log: Callable[[Any, Any], Any]) -> Any:
+    def read_one(name: str, of_table: Callable[[Any, Table, Notes], Any], of_log: Callable[[Any, Any], Any]) -> Any:
         """The sensor of a table of the .toml: from its CSV file, or from the log of another program."""
         section = getattr(d, name)
         if section is None:
@@ -155,7 +155,7 @@ def read_folder(source: str | Path, allow_outside: bool = False) -> Recording:
 
 
 def _load_raw(
-    d: schema.RawGnssTable, path: Path, zero: float | None, allow_outside: bool, remarks: Remarks, files: list[Path]
+    d: schema.RawGnssTable, path: Path, zero: float | None, allow_outside: bool, remarks: Notes, files: list[Path]
 ) -> tuple[RawGnss, Gnss]:
     """The raw observations of [raw_gnss], and single-point fixes computed from them."""
     if zero is None:
@@ -201,7 +201,7 @@ def _load_raw(
     return raw, fixes
 
 
-def _read_truth(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
+def _read_truth(d: schema.TruthTable, file: Path, remarks: Notes) -> Truth:
     """Read the truth from a trajectory file of another program."""
     for key in ("columns", "units", "keep"):
         if key in d.model_fields_set:

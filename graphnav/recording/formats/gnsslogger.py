@@ -16,12 +16,12 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number, read_bytes
 from graphnav.core.findings import compute_period
-from graphnav.core.notes import format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import UNIX, date_week_times, unix_to_gps
 from graphnav.recording import Gnss, Imu
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, LATEST, Remarks, compute_horizontal_velocity
+from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, LATEST, compute_horizontal_velocity
 
 _BEGIN = re.compile(
     rb"^(?:#\s*)?(?:Raw,(?:utcTime|Elapsed)|Fix,(?:Provider|GPS|gps|FLP),|(?:Uncal)?(?:Gyro|Accel),\w)", re.M
@@ -55,7 +55,7 @@ def load(path: Path) -> Log:
     RecordingError
         If neither is in it.
     """
-    remarks = Remarks()
+    remarks = Notes()
     fixes, sensors, unix = _collect_rows(path, remarks)
     chosen = next((some for some in ("gps", "flp", "fused") if some in fixes), None)
     table = np.array(fixes[chosen]) if chosen else np.empty((0, len(_FIX)))
@@ -94,7 +94,7 @@ def load(path: Path) -> Log:
 _Rows = dict[str, list[list[float]]]
 
 
-def _collect_rows(path: Path, remarks: Remarks) -> tuple[_Rows, _Rows, list[float]]:
+def _collect_rows(path: Path, remarks: Notes) -> tuple[_Rows, _Rows, list[float]]:
     """Fixes by provider, in the order of `_FIX`; sensors by kind, s since boot, values and biases; and what is to be
     added to these s for the phone's UTC.
     """
@@ -152,7 +152,7 @@ def _find_fields(header: str) -> list[int | None]:
     return [next((k for k, name in enumerate(names) if name.startswith(begin)), None) for begin in _FIX.values()]
 
 
-def _join_imu(sensors: _Rows, ahead: float, remarks: Remarks) -> Imu | None:
+def _join_imu(sensors: _Rows, ahead: float, remarks: Notes) -> Imu | None:
     """Forces interpolated to the times of the rates, s of Unix time."""
     found = [max(kinds, key=lambda kind: len(sensors.get(kind, ()))) for kinds in (_GYRO, _ACCEL)]
     if not all(len(sensors.get(kind, ())) > 1 for kind in found):
@@ -179,7 +179,7 @@ def _join_imu(sensors: _Rows, ahead: float, remarks: Remarks) -> Imu | None:
     return Imu(t[there] + ahead, rates[there], forces)
 
 
-def _make_gnss(fix: dict[str, Array], remarks: Remarks) -> Gnss | None:
+def _make_gnss(fix: dict[str, Array], remarks: Notes) -> Gnss | None:
     """Fixes with the phone's accuracies, s of Unix time."""
     t, first = np.unique(fix["unix"] * 1e-3, return_index=True)
     fix = {name: values[first] for name, values in fix.items()}

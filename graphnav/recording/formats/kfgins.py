@@ -23,7 +23,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import check_inside, parse_number, read_bytes
-from graphnav.core.notes import format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK
 from graphnav.recording import Gnss, Imu, Odometer, Truth
@@ -36,7 +36,6 @@ from graphnav.recording.formats.kfgins_configuration import (
 )
 from graphnav.recording.formats.places import is_on_earth
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import Remarks
 from graphnav.recording.formats.schema import parse_axes_letters
 from graphnav.recording.formats.text import parse_table, split_lines
 from graphnav.recording.formats.trajectories import read_trajectory
@@ -67,7 +66,7 @@ def load(path: Path, allow_outside: bool = False) -> Log:
     RecordingError
         Naming the file and the line, column or key that cannot be used.
     """
-    remarks = Remarks()
+    remarks = Notes()
     config: dict[str, Any] = {}
     config_file = path if path.suffix.lower() in (".yaml", ".yml") else _find_config(path) if path.is_dir() else None
     if config_file is not None:
@@ -196,7 +195,7 @@ def _find_pair(path: Path) -> tuple[Path | None, Path | None]:
     return out[0], out[1]
 
 
-def _find_truth(folder: Path, remarks: Remarks) -> Path | None:
+def _find_truth(folder: Path, remarks: Notes) -> Path | None:
     """The truth, which no key names: the only .nav file, or the only one called truth."""
     found = [p for p in sorted(folder.iterdir()) if p.suffix.lower() == ".nav" and "navresult" not in p.name.lower()]
     named = [p for p in found if "truth" in p.name.lower()]
@@ -208,7 +207,7 @@ def _find_truth(folder: Path, remarks: Remarks) -> Path | None:
     return next(iter(named or found), None)
 
 
-def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
+def _read_imu(path: Path, remarks: Notes) -> tuple[Imu, Array | None]:
     if path.suffix.lower() == ".bin":
         data = read_bytes(path, text=False)
         if len(data) % 56:
@@ -264,7 +263,7 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
     return imu, table[:, 7].copy() if table.shape[1] == 8 else None
 
 
-def _read_fixes(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
+def _read_fixes(path: Path, lever_arm: Array, remarks: Notes) -> Gnss:
     rows = [(n, line) for n, line in enumerate(split_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"]
     if not rows:
         raise RecordingError(f"{path}: no rows in it", key="file.no_rows")

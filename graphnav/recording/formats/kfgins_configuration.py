@@ -15,9 +15,9 @@ import numpy as np
 from graphnav.core.complaints import check_whole_numbers
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import is_inside, read_text
+from graphnav.core.notes import Notes
 from graphnav.core.rotation import Array
 from graphnav.recording import ImuNoise
-from graphnav.recording.formats.repair import Remarks
 from graphnav.recording.formats.schema import parse_axes_letters
 
 DEG_PER_H = np.pi / 180 / 3600  # rad/s
@@ -109,7 +109,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-def read_imu_noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
+def read_imu_noise(where: Path, config: dict[str, Any], remarks: Notes) -> ImuNoise:
     """The noise figures of the IMU."""
     section = config.get("imunoise", config.get("imumodel"))
     if not isinstance(section, dict):
@@ -149,7 +149,7 @@ def read_imu_noise(where: Path, config: dict[str, Any], remarks: Remarks) -> Imu
     )
 
 
-def mention_unused(config: dict[str, Any], remarks: Remarks) -> None:
+def mention_unused(config: dict[str, Any], remarks: Notes) -> None:
     """Remark on keys of the configuration that have no equivalent in a recording."""
     if any(key in config for key in ("starttime", "endtime")):
         span = f"{str(config.get('starttime', ''))[:30]} to {str(config.get('endtime', ''))[:30]}"

@@ -14,12 +14,11 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import check_inside, parse_number
-from graphnav.core.notes import format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Truth
 from graphnav.recording.formats.places import is_on_earth
 from graphnav.recording.formats.registry import Log, log_format
-from graphnav.recording.formats.repair import Remarks
 from graphnav.recording.formats.schema import parse_axes_letters
 from graphnav.recording.formats.text import split_lines
 
@@ -50,7 +49,7 @@ def load(path: Path, allow_outside: bool = False) -> Log:
     folder = _find_oxts(path)
     if folder is None:
         raise RecordingError(f"{path}: no KITTI folder 'oxts' with timestamps.txt and data in it", key="log.no_folder")
-    remarks = Remarks()
+    remarks = Notes()
     samples = sorted((folder / "data").glob("*.txt"))
     if not allow_outside:
         check_inside([folder / "timestamps.txt", *samples], path)

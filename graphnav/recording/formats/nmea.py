@@ -18,13 +18,13 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number, read_bytes
-from graphnav.core.notes import format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import date_week_times, utc_to_gps
+from graphnav.core.timescales import count_leap_seconds, date_week_times, utc_to_gps
 from graphnav.recording import Gnss, convert_fix_types
 from graphnav.recording.formats import novatel, ubx
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, compute_horizontal_velocity
+from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, compute_horizontal_velocity
 
 KNOTS = 1852 / 3600  # m/s
 KMH = 1 / 3.6
@@ -72,7 +72,7 @@ def load(path: Path) -> Log:
     RecordingError
         If no sentence gives a position, naming the first line that is no sentence, if any.
     """
-    remarks = Remarks()
+    remarks = Notes()
     data = read_bytes(path)
     checked = _CHECKSUM.search(data) is not None
     if not checked:
@@ -223,7 +223,7 @@ def _parse_field(value: Any) -> float:
         return float("nan")
 
 
-def _date_fixes(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> tuple[Array, float | None]:
+def _date_fixes(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Notes) -> tuple[Array, float | None]:
     """GPS seconds of week of the fixes and where the week begins; a step back by half a day starts the next day."""
     days, day, before = {}, 0, epochs[0].time
     for e in epochs:
@@ -238,9 +238,9 @@ def _date_fixes(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> 
         )
         return of_day, None
     midnight = np.datetime64(dated.date, "us") - np.timedelta64(days[dated.line], "D")
-    gps = utc_to_gps(midnight + (of_day * 1e6).round().astype("timedelta64[us]"))
-    t, zero = date_week_times(gps)
-    ahead = round(float(gps[0] - (midnight - np.datetime64("1980-01-06", "us")) / np.timedelta64(1, "s") - of_day[0]))
+    utc = midnight + (of_day * 1e6).round().astype("timedelta64[us]")
+    t, zero = date_week_times(utc_to_gps(utc))
+    ahead = int(count_leap_seconds(utc)[0])
     remarks.add(
         "log.clock",
         f"clock: UTC turned into GPS time ({ahead} leap seconds in {dated.date.year}), seconds of the GPS week",
@@ -248,7 +248,7 @@ def _date_fixes(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> 
     return t, zero
 
 
-def _read_sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
+def _read_sigmas(fixes: list[_Epoch], remarks: Notes) -> Array:
     sd = np.full((len(fixes), 3), np.nan)
     for k, e in enumerate(fixes):
         if e.gst is not None:
@@ -270,7 +270,7 @@ def _read_sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
     return sd
 
 
-def _read_velocities(fixes: list[_Epoch], remarks: Remarks) -> tuple[Array | None, Array | None]:
+def _read_velocities(fixes: list[_Epoch], remarks: Notes) -> tuple[Array | None, Array | None]:
     speed = np.array([np.nan if e.speed is None else e.speed for e in fixes])
     course = np.radians([np.nan if e.course is None else e.course for e in fixes])
     if np.isnan(speed).all():

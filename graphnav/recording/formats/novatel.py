@@ -21,12 +21,13 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number, read_bytes
 from graphnav.core.findings import compute_period
-from graphnav.core.notes import format_count
+from graphnav.core.interpolation import pick_nearest
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, date_week_times
 from graphnav.recording import Gnss, Imu, Truth, convert_fix_types
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import DEFAULT_SD_V, LATEST, Remarks
+from graphnav.recording.formats.repair import DEFAULT_SD_V, LATEST
 
 _HEADER = re.compile(rb"[#%][A-Z][A-Z0-9]{3,}A,[^;\r\n]{4,200};")
 _BEGIN = re.compile(rb"[#%](?=[A-Z]{3})")
@@ -117,7 +118,7 @@ def load(path: Path) -> Log:
     RecordingError
         If nothing of these is in it, or it is not known what a count of the IMU is.
     """
-    content, remarks = _collect_rows(path), Remarks()
+    content, remarks = _collect_rows(path), Notes()
     if content.broken:
         remarks.add(
             "log.broken_lines",
@@ -196,7 +197,7 @@ def _parse_line(line: bytes) -> tuple[str, _Row | None]:
     return _SHORT.get(name, name), (t, words, numbers)
 
 
-def _read_imu(path: Path, content: _Content, zero: float, remarks: Remarks) -> Imu | None:
+def _read_imu(path: Path, content: _Content, zero: float, remarks: Notes) -> Imu | None:
     """Rates and forces in the axes of the IMU's body.
 
     Raises
@@ -261,7 +262,7 @@ def _choose(content: _Content, gnss_only: str, any_source: str) -> str:
     return gnss_only if any(_is_solved(row[1]) for row in content.rows.get(gnss_only, ())) else any_source
 
 
-def _read_gnss(content: _Content, zero: float, remarks: Remarks) -> Gnss | None:
+def _read_gnss(content: _Content, zero: float, remarks: Notes) -> Gnss | None:
     """Fixes with their types, and velocities of the same times."""
     name = _choose(content, "BESTGNSSPOS", "BESTPOS")
     t, words, numbers = content.take(name, _is_solved)
@@ -295,7 +296,7 @@ def _read_gnss(content: _Content, zero: float, remarks: Remarks) -> Gnss | None:
     )  # fmt: skip
 
 
-def _read_velocities(content: _Content, t: Array, remarks: Remarks) -> tuple[Array | None, float]:
+def _read_velocities(content: _Content, t: Array, remarks: Notes) -> tuple[Array | None, float]:
     """East, north, up (N, 3) m/s at the times of the fixes, NaN where there is none, and how long before them these
     are of, s: an average since the last solution is of half of that time before.
     """
@@ -304,7 +305,7 @@ def _read_velocities(content: _Content, t: Array, remarks: Remarks) -> tuple[Arr
     if not len(at):
         return None, 0.0
     latency = Counter(numbers[:, 0].tolist()).most_common(1)[0][0]
-    k = np.minimum(np.searchsorted(at, t - 1e-3), len(at) - 1)
+    k = pick_nearest(at, t)
     there = (np.abs(at[k] - t) < 1e-3) & (numbers[k, 0] == latency)
     _, speed, course, up = numbers[k].T
     course = np.radians(course)
@@ -318,7 +319,7 @@ def _read_velocities(content: _Content, t: Array, remarks: Remarks) -> tuple[Arr
     return (v, latency) if there.any() else (None, 0.0)
 
 
-def _read_truth(content: _Content, zero: float, remarks: Remarks) -> Truth | None:
+def _read_truth(content: _Content, zero: float, remarks: Notes) -> Truth | None:
     """The solution of the receiver's INS; its y axis points forward, so that its angles are graphnav's."""
     for name in ("INSPVA", "INSPVAX"):
         t, _, numbers = content.take(name, lambda words: words[0] in _INS_SOLVED)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Notes
 from graphnav.core.rotation import Array
-from graphnav.recording.formats.repair import Remarks, format_row_count
+from graphnav.recording.formats.repair import format_row_count
 from graphnav.recording.formats.table import Selection, Table
 
 _HIGHEST = 9000.0  # m, highest drive on Earth
@@ -34,7 +35,7 @@ def is_on_earth(lat: Array, lon: Array, h: Array) -> Selection:
     return np.asarray(near)
 
 
-def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, remarks: Remarks) -> tuple[Array, Table]:
+def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, remarks: Notes) -> tuple[Array, Table]:
     """(lat, lon, h) in rad, rad, m of rows with usable position, and those rows.
 
     `unit` is that of the angles; None means degrees, and angles that are all small enough to be radians are refused.

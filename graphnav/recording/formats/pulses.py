@@ -6,14 +6,14 @@ from typing import Literal
 
 import numpy as np
 
+from graphnav.core.notes import Notes
 from graphnav.core.rotation import Array
-from graphnav.recording.formats.repair import Remarks
 
 _MODULI = (2.0**8, 2.0**16, 2.0**32)
 
 
 def count_pulses(
-    pulses: Array, kind: Literal["cumulative", "per_row"] | None, signed: bool | None, remarks: Remarks
+    pulses: Array, kind: Literal["cumulative", "per_row"] | None, signed: bool | None, remarks: Notes
 ) -> Array:
     """(M,) pulses since the first row.
 
@@ -34,7 +34,7 @@ def count_pulses(
     return np.r_[0.0, np.cumsum(_count_steps(pulses, step, signed, remarks))]
 
 
-def _count_steps(pulses: Array, step: Array, signed: bool | None, remarks: Remarks) -> Array:
+def _count_steps(pulses: Array, step: Array, signed: bool | None, remarks: Notes) -> Array:
     """Steps between rows without the jumps of a counter that overflowed or restarted."""
     back = step < 0.0
     if not back.any() or pulses.min() < 0.0:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import UNIX, find_restarts
 from graphnav.recording import FIX_TYPES, convert_fix_types
@@ -38,16 +38,8 @@ DEFAULT_SD_V = (0.2, 0.2, 0.4)  # m/s
 NMEA_TYPES = {0: 0, 1: 5, 2: 4, 3: 0, 4: 1, 5: 2, 9: 3}
 
 
-class Remarks(list[str]):
-    """Notes on what loading changed or assumed."""
-
-    def add(self, key: str, sentence: str) -> None:
-        """Add a note under a key."""
-        self.append(Note(key, sentence))
-
-
 def select_usable_rows(
-    rows: Table, sensor: str, needed: tuple[str, ...], keep: Keep | None, unit: str, offset: float, remarks: Remarks
+    rows: Table, sensor: str, needed: tuple[str, ...], keep: Keep | None, unit: str, offset: float, remarks: Notes
 ) -> Table:
     """The rows complete in the needed values, ordered by time, without repeated times; t in seconds plus `offset`.
 
@@ -223,7 +215,7 @@ def choose_sigmas(
     default: tuple[float, float, float],
     what: str,
     used: Selection,
-    remarks: Remarks,
+    remarks: Notes,
 ) -> Array:
     """The 1-sigmas of `used` rows (N, 3): the file's, else the .toml's, else a default that is remarked on.
 

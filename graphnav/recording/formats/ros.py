@@ -16,12 +16,13 @@ import numpy as np
 
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import format_count
+from graphnav.core.interpolation import pick_nearest
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import unix_to_gps
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, convert_fix_types
 from graphnav.recording.formats.registry import Log, log_format
-from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, Remarks
+from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V
 from graphnav.recording.formats.schema import parse_axes_letters
 
 _IMU, _FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
@@ -57,7 +58,7 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
     RecordingError
         If the bag cannot be read or holds none of these.
     """
-    remarks = Remarks()
+    remarks = Notes()
     topics, others = _read_topics(path)
     if not topics:
         kinds = ", ".join(sorted(others)[:6]) or "nothing"
@@ -150,7 +151,7 @@ def _build_table(topic: _Topic) -> tuple[Array, Array]:
     return t, rows[first]
 
 
-def _make_imu(topic: _Topic, remarks: Remarks) -> Imu | None:
+def _make_imu(topic: _Topic, remarks: Notes) -> Imu | None:
     t, rows = _build_table(topic)
     good = np.isfinite(rows[:, :6]).all(-1)
     if good.sum() < 2:
@@ -174,7 +175,7 @@ def _make_imu(topic: _Topic, remarks: Remarks) -> Imu | None:
     return Imu(t, rows[:, :3] @ R_bs.T, rows[:, 3:6] @ R_bs.T, noise, R_bs, assumed)
 
 
-def _make_gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
+def _make_gnss(topic: _Topic, remarks: Notes) -> Gnss | None:
     t, rows = _build_table(topic)
     good = np.isfinite(rows[:, :3]).all(-1) & (rows[:, 6] >= 0) & (rows[:, :2] != 0).any(-1)
     if not good.any():
@@ -200,7 +201,7 @@ def _make_gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
     return Gnss(t, np.column_stack([np.radians(rows[:, :2]), rows[:, 2]]), sd, type=kinds)
 
 
-def _read_wheel(topic: _Topic, remarks: Remarks) -> Odometer:
+def _read_wheel(topic: _Topic, remarks: Notes) -> Odometer:
     t, rows = _build_table(topic)
     good = np.isfinite(rows).all(-1)
     remarks.add("odometer.read_as", f"odometer: {topic.name}, linear.x as forward speed in m/s")
@@ -208,7 +209,7 @@ def _read_wheel(topic: _Topic, remarks: Remarks) -> Odometer:
     return Odometer(t[good], rows[good, 0])
 
 
-def _add_velocity(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> Gnss | None:
+def _add_velocity(topic: _Topic, gnss: Gnss | None, remarks: Notes) -> Gnss | None:
     """The fixes with a velocity over ground."""
     if gnss is None:
         remarks.add(
@@ -219,8 +220,7 @@ def _add_velocity(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> Gnss | 
     t, rows = _build_table(topic)
     good = np.isfinite(rows).all(-1)
     t, rows = t[good], rows[good]
-    k = np.clip(np.searchsorted(t, gnss.t), 1, len(t) - 1)
-    near = np.where(np.abs(t[k] - gnss.t) < np.abs(t[k - 1] - gnss.t), k, k - 1)
+    near = pick_nearest(t, gnss.t)
     same = np.abs(t[near] - gnss.t) < 0.05
     v = np.where(same[:, None], rows[near], np.nan)
     sd_v = np.where(same[:, None], DEFAULT_SD_V, np.nan)

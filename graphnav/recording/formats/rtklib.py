@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.recording import Gnss, convert_fix_types
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import Remarks
 from graphnav.recording.formats.trajectories import read_trajectory
 
 # 1-sigma of a receiver's own single-point velocity where the file states none (see folder.DEFAULT_SD_V)
@@ -36,7 +35,7 @@ def load(path: Path) -> Log:
         As `graphnav.recording.formats.trajectories.read_trajectory`.
     """
     track = read_trajectory(path)
-    remarks = Remarks(track.notes)
+    remarks = Notes(track.notes)
     t = track.t
     sd = track.sd_p
     if sd is None:

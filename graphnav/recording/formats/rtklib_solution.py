@@ -15,12 +15,11 @@ import numpy as np
 
 from graphnav.core.earth import LocalFrame, ecef_to_llh, enu_axes
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Notes
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import GPS_TO_UNIX, WEEK, date_week_times, unix_to_gps
+from graphnav.core.timescales import GPS_EPOCH, GPS_TO_UNIX, WEEK, date_week_times, unix_to_gps
 from graphnav.recording.formats.text import NumberedLines, parse_table
 
-_GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 _ZONES = {"UTC": 0.0, "JST": 9 * 3600.0}  # s ahead of UTC
 _NUMBER = r"[-+]?\d+(?:\.\d*)?"
 # the columns of a position, the letters of its axes in those of sigmas, and the order of east, north, up in them
@@ -72,10 +71,10 @@ def parse_solution(path: Path, head: list[str], rows: NumberedLines) -> RtklibSo
         )
     of_base = _parse_base(path, head) if form == "e-baseline" else None
     separator = "," if "," in rows[0][1] else None
-    notes: list[str] = []
+    notes = Notes()
     if len(rows) > 1 and len(rows[-1][1].split(separator)) < len(rows[-2][1].split(separator)):
         sentence = f"{path.name} ends within a line, as after a loss of power: it is left out"
-        notes.append(Note("trajectory.cut", sentence))
+        notes.add("trajectory.cut", sentence)
         rows = rows[:-1]
     sexagesimal = form == "latitude" and "latitude(d'" in titles
     if sexagesimal:  # three numbers for each angle
@@ -90,10 +89,10 @@ def parse_solution(path: Path, head: list[str], rows: NumberedLines) -> RtklibSo
     if scale in _ZONES:
         gps = unix_to_gps(gps + GPS_TO_UNIX - _ZONES[scale])
         sentence = f"{path.name}: times were in {scale}; the leap seconds of their date make them GPS time"
-        notes.append(Note("trajectory.time_scale", sentence))
+        notes.add("trajectory.time_scale", sentence)
     if any("lat/lon/height=WGS84/geodetic" in line for line in head):
         sentence = f"{path.name}: heights are above mean sea level, not above the ellipsoid"
-        notes.append(Note("trajectory.height", sentence))
+        notes.add("trajectory.height", sentence)
 
     def take(*wanted: str) -> Array | None:
         return table[:, [names.index(n) for n in wanted]] if set(wanted) <= set(names) else None
@@ -188,4 +187,4 @@ def _parse_dates(path: Path, rows: NumberedLines, separator: str | None) -> tupl
                     f"{path}, line {number}: '{stamp.replace('T', ' ')[:60]}' is not a date and time", key="table.date"
                 ) from None
         raise
-    return (when - _GPS_EPOCH) / np.timedelta64(1, "us") * 1e-6, rest
+    return (when - GPS_EPOCH) / np.timedelta64(1, "us") * 1e-6, rest

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.recording import Gnss, take_rows
 from graphnav.recording.formats.places import is_on_earth
 from graphnav.recording.formats.registry import Log
@@ -25,7 +25,7 @@ def drop_unsound_rows(log: Log, path: Path) -> Log:
     RecordingError
         If nothing of a sensor is left.
     """
-    remarks = list(log.remarks)
+    remarks = Notes(log.remarks)
     imu, gnss, odometer, truth = log.imu, log.gnss, log.odometer, log.truth
 
     def check_rows(what: str, good: NDArray[np.bool_], why: str) -> bool:
@@ -33,11 +33,9 @@ def drop_unsound_rows(log: Log, path: Path) -> Log:
             return True
         if good.sum() < (2 if what == "IMU" else 1):
             raise RecordingError(f"{path}: {what}: no usable row among {len(good)}: {why}", key="table.none_sound")
-        remarks.append(
-            Note(
-                f"{what.lower()}.rows_left_out",
-                f"{what}: {format_count(int(np.sum(~good)), 'row')} of {len(good)} left out: {why}",
-            )
+        remarks.add(
+            f"{what.lower()}.rows_left_out",
+            f"{what}: {format_count(int(np.sum(~good)), 'row')} of {len(good)} left out: {why}",
         )
         return False
 

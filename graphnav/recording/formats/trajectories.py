@@ -24,7 +24,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK
 from graphnav.core.trajectory import Trajectory
@@ -98,7 +98,7 @@ def _build(
     rows: list[tuple[int, str]],
     t: Array,
     position: Array,
-    notes: list[str],
+    notes: Notes,
     local: bool = False,
     gps_zero: float | None = None,
     **optional: Array | None,
@@ -131,18 +131,14 @@ def _build(
     usable = np.isfinite(position[:, :2]).all(1) if local else np.isfinite(position).all(1)
     fresh = np.concatenate([[True], np.diff(t) > 0])
     if not usable.all():
-        notes.append(
-            Note(
-                "trajectory.no_position",
-                f"{path.name}: {format_count(int(np.sum(~usable)), 'row')} without a position left out",
-            )
+        notes.add(
+            "trajectory.no_position",
+            f"{path.name}: {format_count(int(np.sum(~usable)), 'row')} without a position left out",
         )
     if not fresh.all():
-        notes.append(
-            Note(
-                "trajectory.repeated",
-                f"{path.name}: left out {format_count(int(np.sum(~fresh)), 'row')} with the time of the row before",
-            )
+        notes.add(
+            "trajectory.repeated",
+            f"{path.name}: left out {format_count(int(np.sum(~fresh)), 'row')} with the time of the row before",
         )
     keep = usable & fresh
     if not keep.any():
@@ -192,7 +188,7 @@ def _read_csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     if not local:
         position[:, :2] *= _DEG
     return _build(
-        path, rows, table[:, columns["t"]], position, [],
+        path, rows, table[:, columns["t"]], position, Notes(),
         v=v, rph=take("roll", "pitch", "heading", scale=_DEG), sd_p=take("sd_e", "sd_n", "sd_u"),
         sd_v=take("sd_ve", "sd_vn", "sd_vu"), sd_rph=take("sd_roll", "sd_pitch", "sd_heading", scale=_DEG),
         gyro_bias=take("bgx", "bgy", "bgz"), accel_bias=take("bax", "bay", "baz"),
@@ -207,7 +203,7 @@ def _read_kf_gins(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     position = np.column_stack([table[:, 2:4] * _DEG, table[:, 4]])
     v = np.column_stack([table[:, 6], table[:, 5], -table[:, 7]])
     zero = WEEK * table[0, 0] if table[0, 0] > 0.0 else None
-    return _build(path, rows, t, position, [], gps_zero=zero, v=v, rph=table[:, 8:11] * _DEG)
+    return _build(path, rows, t, position, Notes(), gps_zero=zero, v=v, rph=table[:, 8:11] * _DEG)
 
 
 def _read_tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
@@ -221,4 +217,4 @@ def _read_tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
             key="table.quaternion",
         )
     rph = rotation.to_rph(rotation.from_quaternion(table[:, [7, 4, 5, 6]]))
-    return _build(path, rows, table[:, 0], table[:, 1:4], [], rph=rph, local=True)
+    return _build(path, rows, table[:, 0], table[:, 1:4], Notes(), rph=rph, local=True)

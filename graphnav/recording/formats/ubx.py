@@ -16,12 +16,11 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import open_file
-from graphnav.core.notes import format_count
+from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.recording import Gnss, Imu, Odometer, convert_fix_types
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import Remarks
 
 _SYNC = b"\xb5\x62"
 _PVT, _HP, _MEAS, _RAW = (1, 7), (1, 0x14), (0x10, 2), (0x10, 3)
@@ -57,7 +56,7 @@ def load(path: Path) -> Log:
         If no position and no sensor is in it.
     """
     content = _collect_messages(path)
-    remarks = Remarks()
+    remarks = Notes()
     if content.broken:
         remarks.add("log.broken_frames", f"{format_count(content.broken, 'broken frame')} skipped")
     fixes = [m for m in content.pvt if m.gnssFixOk and m.fixType in (3, 4)]
@@ -156,11 +155,15 @@ def _find_week_start(message: Any) -> float | None:
 
 def _unroll_tow(messages: list[Any]) -> Array:
     """Times of NAV-PVT messages in s, continuous over the end of a week."""
-    t = np.array([m.iTOW for m in messages]) * 1e-3
-    return np.asarray(t + WEEK * np.cumsum(np.concatenate([[0.0], np.diff(t) < -0.5 * WEEK])))
+    return _unroll(np.array([m.iTOW for m in messages]) * 1e-3, WEEK)
 
 
-def _make_gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
+def _unroll(x: Array, size: float) -> Array:
+    """A counter that runs over at `size`, continuous."""
+    return np.asarray(x + size * np.cumsum(np.diff(x, prepend=x[:1]) < -0.5 * size))
+
+
+def _make_gnss(fixes: list[Any], content: _Content, remarks: Notes) -> Gnss:
     t = _unroll_tow(fixes)
     best = [content.precise.get(m.iTOW, m) for m in fixes]
     best = [m if p is not m and getattr(p, "invalidLlh", False) else p for p, m in zip(best, fixes, strict=True)]
@@ -169,8 +172,7 @@ def _make_gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
     sd = np.maximum(accuracy[:, [0, 0, 1]] / np.sqrt([2.0, 2.0, 1.0]), 1e-3)
     sd_v = np.maximum(np.repeat(accuracy[:, 2:], 3, 1) / np.sqrt(3.0), 1e-3)
     v = np.array([[m.velE, m.velN, -m.velD] for m in fixes]) * 1e-3
-    order = np.argsort(t, kind="stable")
-    order = order[np.concatenate([[True], np.diff(t[order]) > 0])]
+    order = np.unique(t, return_index=True)[1]
     remarks.add(
         "gnss.read_as",
         "GNSS: NAV-PVT, heights above the ellipsoid; sigmas hAcc/sqrt(2) east and north, vAcc up, sAcc/sqrt(3)",
@@ -200,12 +202,11 @@ def _classify_fix(message: Any) -> int:
     return 0 if message.fixType == 4 else 4 if message.diffSoln else 5
 
 
-def _read_sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu | None, Odometer | None]:
+def _read_sensors(path: Path, content: _Content, remarks: Notes) -> tuple[Imu | None, Odometer | None]:
     """The receiver's IMU and wheel speed, on the clock of the fixes if there are any."""
     series = {k: np.array(v, dtype=float).T for k, v in content.samples.items()}
-    for k in series:
-        tags = series[k][0]
-        series[k][0] = tags + _WRAP * np.cumsum(np.concatenate([[0.0], np.diff(tags) < -0.5 * _WRAP]))
+    for one in series.values():
+        one[0] = _unroll(one[0], _WRAP)
     there = [k for k in (*_GYRO, *_ACCEL) if k in series]
     if not series:
         return None, None
@@ -242,13 +243,13 @@ def _drop_repeated(series: Array) -> tuple[Array, Array]:
     return tags, series[1][first]
 
 
-def _fit_clock(content: _Content, remarks: Remarks) -> tuple[float, float]:
+def _fit_clock(content: _Content, remarks: Notes) -> tuple[float, float]:
     """Seconds per time tag, and GPS seconds of the week at tag 0, from the last tags before each fix."""
     if len(content.last_tag) < 2:
         remarks.add("log.sensor_clock_unknown", "clock of the sensors: their own time tags, taken as ms")
         return _TICKS[0], 0.0
     number, tags = np.array(content.last_tag, dtype=float).T
-    tags = tags + _WRAP * np.cumsum(np.concatenate([[0.0], np.diff(tags) < -0.5 * _WRAP]))
+    tags = _unroll(tags, _WRAP)
     t = _unroll_tow(content.pvt)[number.astype(int)]
     slope = (t[-1] - t[0]) / max(tags[-1] - tags[0], 1.0)
     tick = min(_TICKS, key=lambda x: abs(np.log(max(slope, 1e-12) / x)))

@@ -294,7 +294,8 @@ def _find_moving_zeros(
     turn = np.abs((gyro.mean(axis=1) - np.median(gyro[rest].mean(axis=1), axis=0)) @ up) > _MOVING_RATE
     shaken = np.zeros(count, dtype=bool)
     if fast.sum() >= 20:
-        shakes = [np.linalg.norm(x.std(axis=1), axis=-1) for x in (gyro, accel)]
+        # each axis in a row: half of the time
+        shakes = [np.linalg.norm(np.ascontiguousarray(x.transpose(2, 0, 1)).std(axis=2), axis=0) for x in (gyro, accel)]
         like = np.all([x > np.median(x[fast]) for x in shakes], axis=0) & rest
         for a, b in find_runs(like):
             shaken[a:b] = b - a >= _SHAKEN

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import Detection
 from graphnav.recording import Imu, Recording
@@ -117,8 +118,7 @@ def _plot_spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float) ->
         level = np.log10(np.maximum(d.details["spectrogram"], 1e-9)).T
         top = float(np.nanquantile(level, 0.999))
         even = np.linspace(t[0], t[-1], min(len(t), BINS))
-        after = np.clip(np.searchsorted(t, even), 1, len(t) - 1)
-        nearest = after - (even - t[after - 1] < t[after] - even)
+        nearest = pick_nearest(t, even)
         panel.draw_map(even, f, np.clip(np.nan_to_num(level[:, nearest], nan=top - _DECADES), top - _DECADES, top))
         if "idle_line" in d.details:
             line = float(d.details["idle_line"][0])
