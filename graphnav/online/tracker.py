@@ -206,8 +206,9 @@ class Tracker(Chain):
         """Integrate the interval up to the expected keyframe."""
         T, start = self.newest, self.window.newest.state
         imu = cut_around(sensors, T, sensors.imu.newest).imu
-        ends = np.array([T, expected])
-        interval = preintegrate(bridge_gaps(imu, T), imu, ends, start.ba[0], start.bg[0], self._estimates_imu)
+        samples, ends = bridge_gaps(imu, T), np.array([T, expected])
+        self._note_gaps(samples.bridged[:, 1])
+        interval = preintegrate(samples, imu, ends, start.ba[0], start.bg[0], self._estimates_imu)
         self._motions[expected] = ImuFactors(interval, self.frame).prepare()
 
     def _is_covered(self, sensors: Sensors, t: float) -> bool:

@@ -49,7 +49,7 @@ from graphnav.estimation.factor_graph.tree_nodes import (
 )
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import Step, shift
-from graphnav.estimation.solvers.revision import Renewed, linearise_runs
+from graphnav.estimation.solvers.revision import Relaxation, Renewed, linearise_runs
 from graphnav.estimation.solvers.stages import (
     Measured,
     Message,
@@ -252,13 +252,19 @@ class Tree:
         moves[: self.held] = 0.0
         return moves
 
-    def relinearise(self, share: float = 1.0, renewed: Renewed | None = None) -> int:
+    def relinearise(self, share: float, renewed: Renewed | None, relaxation: Relaxation) -> int:
         """Relinearise keyframes that have moved beyond a share of the limits; returns their number."""
         self.read()
         moves = self.find_moves()
         if not (moves > share).any():
             return 0
         which = np.flatnonzero(moves > _ALMOST * share)
+        step = np.zeros((len(self), 3))
+        own = [self.keyframes[i] for i in which]
+        step[which] = [k.state.delta[:3] - k.state.point[:3] for k in own]
+        part = relaxation.find_share(step)
+        for x in {x.key: x for k in own for x in k.variables}.values() if part < 1.0 else ():
+            x.delta = x.point + part * (x.delta - x.point)
         self.linearise_again(which, renewed)
         self.read()
         return len(which)

@@ -33,7 +33,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.incremental import Incremental, begin_at, solve_in_turn
-from graphnav.estimation.solvers.revision import Renewing
+from graphnav.estimation.solvers.revision import Relaxation, Renewing
 from graphnav.estimation.solvers.stages import Message, Place, Stage
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit
 
@@ -120,8 +120,9 @@ class TreeWindow(Window):
             self.tree.linearise_again(range(self.tree.held, len(self.tree)), again)
             self._relinearise_keyframes(len(self))
             share = min(share, _CONVERGED_SHARE)
+        relaxation = Relaxation()
         for _ in range(_MAX_STEPS - always if self.stages else 0):
-            if not (done := self.tree.relinearise(share, again)):
+            if not (done := self.tree.relinearise(share, again, relaxation)):
                 break
             self._relinearise_keyframes(done)
         return False

@@ -21,7 +21,7 @@ from graphnav.estimation.faults.watch import Watch
 from graphnav.estimation.solvers.elimination import Predicted, predict_message, update_late
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.points import move_covariance
-from graphnav.estimation.solvers.revision import Renewed, Renewing, Revision
+from graphnav.estimation.solvers.revision import Relaxation, Renewed, Renewing, Revision
 from graphnav.estimation.solvers.stages import (
     Columns,
     Message,
@@ -101,6 +101,7 @@ class Window:
         self._means: list[Array] | None = None
         self._revision: Revision | None = None
         self._rounds = 0  # of it
+        self._relaxation = Relaxation()  # of these
 
     def __len__(self) -> int:
         return len(self.stages)
@@ -322,7 +323,12 @@ class Window:
             if first is None or self._rounds == _MAX_RELINEARISATIONS:
                 self._rounds = 0
                 return False
-            self._revision, self._rounds = Revision(self, first), self._rounds + 1
+            if not self._rounds:
+                self._relaxation = Relaxation()
+            step = np.array([e[:3] for e in self.compute_means()[1:]])
+            step[:first] = 0.0
+            self._rounds += 1
+            self._revision = Revision(self, first, share=self._relaxation.find_share(step))
         if self._revision.step(count, renewed):
             self._revision = None
         else:
