@@ -296,7 +296,7 @@ class Sensors:
         return None if reads else "beyond any sensor"
 
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
-        if t > self.imu.newest and self._neighbours.is_frozen(t, values):
+        if t > self.imu.newest and self._neighbours.skip_frozen(t, values):
             self.counts[f"imu: {FILLED}"] += 1
             return False
         if t <= self.oldest or (t < self.imu.newest - SAME and not self._clock.fits(t, self.imu.t)):

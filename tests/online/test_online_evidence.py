@@ -47,7 +47,7 @@ def test_what_fills_a_gap_of_the_imu_is_not_taken_for_a_fault_of_the_fixes_behin
 
 @pytest.mark.parametrize("engine", ["window", "isam2"])
 def test_sigmas_at_once_are_true_behind_a_gap_of_the_imu_in_an_outage(engine: str) -> None:
-    """A second and a half in a turn: whole steps of Gauss and Newton swing by degrees, and each makes sigmas smaller."""
+    """A second and a half in a turn: whole Gauss-Newton steps swing by degrees, and each makes sigmas smaller."""
     whole = load("kitti").crop(171.4, 230.5)
     recording, squares = whole.without("gnss", (40.0, 60.0)), []
     online, newest = Online(drop_rows(recording), parse_settings({"vehicle": {"nhc": True}}), engine), -np.inf

@@ -41,9 +41,9 @@ from graphnav.estimation.factor_graph.tree_nodes import (
     make_interval_factor,
     make_isam,
     make_row_factor,
-    read_estimates,
     read_factors,
     read_states,
+    take_deltas,
     update_isam,
     write_factors,
 )
@@ -135,8 +135,8 @@ class Tree:
         # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
         most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
         order = [(v, max(v.last - keyframe.number + most, 0)) for v in self._find_recent()]
-        self._update(made, fresh=fresh, order=order)
-        keyframe.read(self.isam)
+        update_isam(self.isam, place.t, made, fresh=fresh, order=order)
+        take_deltas(self.isam, keyframe.variables)  # in the root, or eliminated just now
 
     def _add_first_keyframe(self, place: Place) -> None:
         """Add the initial message as a keyframe before the first."""
@@ -157,10 +157,10 @@ class Tree:
         self._in_force = nodes
         before = Place(place.t, None)
         self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, frozenset()))
-        self._update(fresh=[*fresh, (x, make_factor(blocks, prior.z))])
+        update_isam(self.isam, place.t, fresh=[*fresh, (x, make_factor(blocks, prior.z))])
         self._number += 1
         self.held = 1
-        self.keyframes[0].read(self.isam)
+        take_deltas(self.isam, self.keyframes[0].variables)
 
     def _find_recent(self) -> Iterable[Variable]:
         for keyframe in self.keyframes[-3:]:
@@ -210,12 +210,6 @@ class Tree:
         self._in_force = in_force
         return in_force
 
-    def _update(
-        self, made: Sequence[Made] = (), gone: Sequence[int] = (), fresh: Sequence[Fresh] = (), **how: Any
-    ) -> None:
-        """As `update_isam`."""
-        update_isam(self.isam, self.keyframes[-1].place.t, made, gone, fresh, **how)
-
     def _enter(self) -> None:
         """Take in the keyframes of a whole drive that wait."""
         (made, fresh), self._waiting = self._waiting, ([], [])
@@ -230,13 +224,14 @@ class Tree:
         if every:
             late, first = list(self.variables.values()), self.keyframes[0].number
         order = [(v, v.last - first) for v in late]
-        self._update(made, gone, fresh, order=order, anew=late if every else None)
+        update_isam(self.isam, self.keyframes[-1].place.t, made, gone, fresh, order, late if every else None)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:
         """Bring all estimates up to date."""
         self._enter()
-        read_estimates(self.isam, self.variables.values())
+        self.isam.calculateBestEstimate()  # by back-substitution through the whole tree
+        take_deltas(self.isam, self.variables.values())
 
     def find_moves(self) -> Array:
         """(K,) how far keyframes' estimates are from where their rows were linearised, 1 at the limit."""
@@ -326,10 +321,6 @@ class Tree:
         self.version += 1
         self._replace([], own, last.number)
         self.read()
-
-    def hold(self) -> None:
-        """The first keyframe is behind the window from now on, and stays as it is."""
-        self.held = 1
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the tree itself, which is made again from its factors."""

@@ -75,10 +75,6 @@ class Keyframe:
         """That its rows may touch, its state first."""
         return {x.key: x for x in (self.state, *(node for node, _ in self.nodes.values()))}.values()
 
-    def read(self, isam: gtsam.ISAM2) -> None:
-        """Bring its variables up to date, where it is the newest: they are in the root, or were eliminated just now."""
-        take_deltas(isam, self.variables)
-
 
 Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, `LINK` or `ROWS`
 Fresh = tuple[Variable, Any]  # a variable that begins, with a factor that comes with it or None
@@ -145,12 +141,6 @@ def update_isam(
         raise explain_smoother(t) from error
     for (keyframe, name, _), index in zip(made, list(result.getNewFactorsIndices())[begin:], strict=True):
         keyframe.slots[name] = index
-
-
-def read_estimates(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
-    """Bring many variables up to date, by back-substitution through the whole tree."""
-    isam.calculateBestEstimate()
-    take_deltas(isam, variables)
 
 
 def take_deltas(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -61,6 +62,15 @@ class SettledStates:
         return len(self.t)
 
 
+class Leaving(Protocol):
+    """Covariances of the first `count` stages, in portions."""
+
+    count: int
+
+    def step(self, most: int) -> bool:
+        """Go on, over at most so many stages; True once all are known."""
+
+
 class _Covariances:
     """Covariances of the first `count` of some stages, smoothed back from the last a portion at a time."""
 
@@ -70,7 +80,7 @@ class _Covariances:
         self.found: list[Array] = []  # (D, D), the last first
 
     def step(self, most: int) -> bool:
-        """Go back over at most so many stages; True once all are known."""
+        """As of `Leaving`."""
         for _ in range(most):
             if len(self.found) == self.count:
                 break
@@ -97,7 +107,7 @@ class Window:
         self.stages: list[Stage] = []
         self.relinearized = 0  # stages made anew
         self._limit: tuple[Columns, Array] = {}, np.empty(0)
-        self._covariances: _Covariances | None = None  # covariances of stages to be settled
+        self._leaving: Leaving | None = None  # stages to be settled
         self._means: list[Array] | None = None
         self._revision: Revision | None = None
         self._rounds = 0  # of it
@@ -171,7 +181,7 @@ class Window:
         if keep >= len(self.stages):
             return
         del self.stages[keep:]
-        self._means = self._covariances = None
+        self._means = self._leaving = None
         if self.stages:
             self.stages[-1] = self.stages[-1].move(self.stages[-1].message.estimate)
         else:
@@ -187,7 +197,7 @@ class Window:
         self.stages[first:] = stages
         if stages:
             self.stages[-1] = self.stages[-1].move(self.stages[-1].message.estimate)
-        self._means = self._covariances = None
+        self._means = self._leaving = None
         self.relinearized += len(stages)
 
     def compute_means(self) -> list[Array]:
@@ -212,22 +222,25 @@ class Window:
 
         Keyframes that arrive meanwhile do not count; when some are removed, it starts again.
         """
-        if self._covariances is None:
-            self._covariances = _Covariances(self.stages, count)
-        return self._covariances.step(most)
+        if self._leaving is None:
+            self._leaving = self._begin_leaving(count)
+        return self._leaving.step(most)
+
+    def _begin_leaving(self, count: int) -> Leaving:
+        return _Covariances(self.stages, count)
 
     @property
     def leaving(self) -> int:
         """Number of stages that `smooth_back` is working on, 0 if it has not started."""
-        return 0 if self._covariances is None else self._covariances.count
+        return 0 if self._leaving is None else self._leaving.count
 
     def settle(self, count: int) -> SettledStates:
         """Smooth the window and marginalise its first `count` stages."""
-        gone, means, back = self.stages[:count], self.compute_means()[1 : count + 1], self._covariances
-        if back is None or back.count != count:
+        gone, means, back = self.stages[:count], self.compute_means()[1 : count + 1], self._leaving
+        if not isinstance(back, _Covariances) or back.count != count:
             back = _Covariances(self.stages, count)
         back.step(len(self.stages))
-        self._revision, self._covariances, self._rounds = None, None, 0
+        self._revision, self._leaving, self._rounds = None, None, 0
         columns = tuple(stage.message.columns for stage in gone)
         rows, covariance, sigma = [], np.empty((len(gone), DIM, DIM)), []
         for k, (stage, P) in enumerate(zip(gone, reversed(back.found), strict=True)):
@@ -257,10 +270,10 @@ class Window:
     # ------------------------------------------------------------------------------------------ linearising again
     def find_first_moved(self, share: float = 1.0) -> int | None:
         """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
-        far = self._moves() > share
+        far = self._find_moves() > share
         return int(np.argmax(far)) if far.any() else None
 
-    def _moves(self) -> Array:
+    def _find_moves(self) -> Array:
         """(n,) how far the smoothed states are from their points, 1 at the limit."""
         means, limit = self.compute_means()[1:], self._limit[1]
         if not means:
@@ -299,7 +312,7 @@ class Window:
         """The first stage to be relinearised, stages that have moved almost as far included."""
         if every:
             return 0
-        moves = self._moves()
+        moves = self._find_moves()
         return int(np.argmax(moves > _ALMOST * share)) if np.any(moves > share) else None
 
     def linearise_at(self, means: Sequence[Array]) -> None:
