@@ -233,11 +233,9 @@ def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns
             f"the noise of the IMU before {place.t:.3f} s is zero: check its figures", key="solver.no_imu_noise"
         ) from None
     link = np.zeros((1, DIM, DIM + D + 1))
-    link[:, :, :DIM] = -F
-    link[:, :, DIM : 2 * DIM] = _I
+    link[:, :, :DIM], link[:, :, DIM : 2 * DIM] = -F[:, :, :DIM], _I
     if scale is not None:
-        at = columns[SCALE]
-        link[:, :, DIM + at.start : DIM + at.stop] = -motion.scale_columns(row, F, at.stop - at.start)
+        link[:, :, DIM:][:, :, columns[SCALE]] = -F[:, :, DIM:]
     return ahead, values, columns, (W @ motion.rotate_to_body(link, before.state.R_nb, row))[0]
 
 
@@ -312,8 +310,7 @@ def linearise_keyframes(
         link = np.zeros((n, DIM, DIM + D + 1))
         link[:, :, :DIM], link[:, :, DIM : 2 * DIM], S, link[:, :, -1] = linearise_links(motion, states, scale)
         if scale is not None:
-            here = columns[SCALE]
-            link[:, :, DIM + here.start : DIM + here.stop] = S
+            link[:, :, DIM:][:, :, columns[SCALE]] = S
         links = list(link)
     parts: list[list[Measured]] = [[] for _ in places]
     for constraint in problem.constraints if rows is None else rows:
