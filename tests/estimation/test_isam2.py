@@ -317,7 +317,7 @@ def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(built: Pro
         leaving, count = Elimination(tree, 6), 6
         assert not leaving.step(20)
         if again:
-            tree.linearise_again(range(3, len(tree)))
+            tree.linearise_again(range(3, len(tree)), lambda a, b: [stage.place for stage in window.stages[a:b]])
         expected = [tree.isam.marginalCovariance(k.state.key) for k in tree.keyframes[:count]]
         unit = tree.keyframes[0].state.unit
         if not again:

@@ -109,7 +109,7 @@ class Tree:
         x = self._add_variable(np.zeros(DIM), _UNIT, place.t)
         nodes = self._open(place, fresh)
         names = frozenset(one.name for one in rows)
-        keyframe = Keyframe(self._number, place, x, ahead.state, columns, nodes, names)
+        keyframe = Keyframe(self._number, place.t, x, ahead.state, columns, nodes, names)
         for node, _ in nodes.values():
             node.last = self._number
         keyframe.put(ahead.state, ahead.values)
@@ -155,8 +155,7 @@ class Tree:
                 self._constant.add(name)
                 self._first_sigma[name] = p.sigma
         self._in_force = nodes
-        before = Place(place.t, None)
-        self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, frozenset()))
+        self.keyframes.append(Keyframe(self._number, place.t, x, prior.state, prior.columns, nodes, frozenset()))
         update_isam(self.isam, place.t, fresh=[*fresh, (x, make_factor(blocks, prior.z))])
         self._number += 1
         self.held = 1
@@ -224,7 +223,7 @@ class Tree:
         if every:
             late, first = list(self.variables.values()), self.keyframes[0].number
         order = [(v, v.last - first) for v in late]
-        update_isam(self.isam, self.keyframes[-1].place.t, made, gone, fresh, order, late if every else None)
+        update_isam(self.isam, self.keyframes[-1].t, made, gone, fresh, order, late if every else None)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:
@@ -247,7 +246,7 @@ class Tree:
         moves[: self.held] = 0.0
         return moves
 
-    def relinearise(self, share: float, renewed: Renewed | None, relaxation: Relaxation) -> int:
+    def relinearise(self, share: float, renewed: Renewed, relaxation: Relaxation) -> int:
         """Relinearise keyframes that have moved beyond a share of the limits; returns their number."""
         self.read()
         moves = self.find_moves()
@@ -264,8 +263,11 @@ class Tree:
         self.read()
         return len(which)
 
-    def linearise_again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
-        """Linearise keyframes, and the intervals on either side, where they are now."""
+    def linearise_again(self, which: Iterable[int], renewed: Renewed) -> None:
+        """Linearise keyframes, and the intervals on either side, where they are now.
+
+        `renewed` returns the places of those from one index to another, which count from those held on.
+        """
         rows = {i for i in map(int, which) if i >= self.held}
         if not rows:
             return
@@ -274,9 +276,7 @@ class Tree:
         made: list[Made] = []
         for run in group_runs(sorted(rows | links), lambda last, i: i == last + 1):
             first, own = run[0], self.keyframes[run[0] : run[-1] + 1]
-            places = [k.place for k in own]
-            if renewed is not None:
-                places = list(renewed(first - self.held, first - self.held + len(own)))
+            places = renewed(first - self.held, first - self.held + len(own))
             # the interval before the oldest keyframe is gone
             places = [p if LINK in k.slots else replace(p, linked=False) for p, k in zip(places, own, strict=True)]
             around = [self.keyframes[max(first - 1, 0)], *own]

@@ -129,7 +129,7 @@ class Elimination:
             while not self.step():
                 pass
         except RuntimeError:  # GTSAM's for a variable that nothing determines
-            raise explain_undetermined(own[0].place.t) from None
+            raise explain_undetermined(own[0].t) from None
         assert self._net is not None
         self._tree.read()
         found = Eliminated(self._net).compute_covariances()
@@ -143,7 +143,7 @@ class Elimination:
             sigma.append(out)
         about = np.stack([marginal[k.state.key] for k in own])
         return SettledStates(
-            t=np.array([k.place.t for k in own]),
+            t=np.array([k.t for k in own]),
             states=read_states(own),
             covariance=move_covariance(about, np.array([k.state.delta for k in own])),
             columns=tuple(k.columns for k in own),

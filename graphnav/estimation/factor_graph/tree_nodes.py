@@ -41,7 +41,7 @@ class Variable:
 @dataclass(eq=False)
 class Keyframe:
     number: int
-    place: Place
+    t: float  # s
     state: Variable
     anchor: States  # one
     columns: Columns

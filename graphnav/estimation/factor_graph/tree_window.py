@@ -28,7 +28,7 @@ from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.incremental import Incremental, begin_at, solve_in_turn
 from graphnav.estimation.solvers.revision import Relaxation, Renewing
 from graphnav.estimation.solvers.stages import Message, Place, Stage
-from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit
+from graphnav.estimation.solvers.window import Window, compute_turn_limit
 
 _MAX_STEPS = 5
 _CONVERGED_SHARE = 0.02  # of the usual limits, within which the last window is converged
@@ -94,13 +94,13 @@ class TreeWindow(Window):
     def revise(self, count: int, renewed: Renewing | None, always: bool = False, share: float = 1.0) -> bool:
         """As of `Window`, but all at once; False, as nothing is left to do."""
 
-        def renew_at_once(first: int, end: int) -> Sequence[Place]:
-            assert renewed is not None
+        def again(first: int, end: int) -> Sequence[Place]:
+            if renewed is None:
+                return [stage.place for stage in self.stages[first:end]]
             while (places := renewed(first, end)) is None:
                 pass
             return places
 
-        again = None if renewed is None else renew_at_once
         for keyframe, stage, e in zip(self.tree.keyframes[self.tree.held :], self.stages, self._points, strict=False):
             keyframe.put(stage.message.state.plus(e[None, :DIM]), stage.message.values + e[DIM:])
         always, self._points = always or bool(len(self._points)), ()
@@ -141,23 +141,13 @@ class TreeWindow(Window):
         else:
             self.head = self.head.move(self.head.estimate)
 
-    def settle(self, count: int) -> SettledStates:
-        """Let the first `count` stages go, as the tree knows them."""
-        gone = self.stages[:count]
-        if not gone:
-            return super().settle(0)
-        leaving = self._leaving if self.leaving == count else self._begin_leaving(count)
-        assert isinstance(leaving, Elimination)
-        out, self._leaving = leaving.settle(), None
-        self.head = gone[-1].message
-        del self.stages[:count]
+    def _marginalise(self, count: int) -> None:
         if len(self.tree) > self.tree.held + count:
             self.tree.marginalise(self.tree.held + count - 1)
             self.tree.held = 1
             self.head = replace(find_head(self.tree), tests=self.head.tests)
         else:
             self.tree = Tree(self.head, self.turn, self._whole)
-        return out
 
 
 def _replace_message(stage: Stage, state: States, values: Array, R: Array) -> Stage:

@@ -63,33 +63,52 @@ class SettledStates:
 
 
 class Leaving(Protocol):
-    """Covariances of the first `count` stages, in portions."""
+    """The first `count` stages of a window, to be settled: their covariances come in portions."""
 
     count: int
 
     def step(self, most: int) -> bool:
-        """Go on, over at most so many stages; True once all are known."""
+        """Go on, over at most so many stages; True once all covariances are known."""
+
+    def settle(self) -> SettledStates:
+        """As they are known now, with what is left of the covariances all at once."""
 
 
 class _Covariances:
-    """Covariances of the first `count` of some stages, smoothed back from the last a portion at a time."""
+    """The first stages of a window, with covariances smoothed back from the newest one."""
 
-    def __init__(self, stages: Sequence[Stage], count: int) -> None:
-        self.count, self._stages = count, list(stages)
-        self._P = stages[-1].message.covariance if stages else np.empty((0, 0))
-        self.found: list[Array] = []  # (D, D), the last first
+    def __init__(self, window: Window, count: int) -> None:
+        self.count, self._window, self._stages = count, window, list(window.stages)
+        self._P = window.newest.covariance
+        self._found: list[Array] = []  # (D, D), the last first
 
     def step(self, most: int) -> bool:
         """As of `Leaving`."""
         for _ in range(most):
-            if len(self.found) == self.count:
+            if len(self._found) == self.count:
                 break
             stage = self._stages.pop()
             if len(self._stages) < self.count:
-                self.found.append(self._P)
+                self._found.append(self._P)
             if self._stages:
                 self._P = stage.predict_before(self._P)
-        return len(self.found) == self.count
+        return len(self._found) == self.count
+
+    def settle(self) -> SettledStates:
+        """As of `Leaving`."""
+        self.step(len(self._stages))
+        gone, means = self._window.stages[: self.count], self._window.compute_means()[1 : self.count + 1]
+        states, turns = States.stack([stage.message.state for stage in gone]), gone[-1].message.turns
+        moved, found = np.array([e[:DIM] for e in means]), self._found[::-1]
+        covariance = np.array([P[:DIM, :DIM] for P in found])
+        return SettledStates(
+            t=np.array([stage.place.t for stage in gone]),
+            states=add_error(states, moved, turns),
+            covariance=turn_covariance(covariance, states, moved) if turns else move_covariance(covariance, moved),
+            columns=tuple(stage.message.columns for stage in gone),
+            values=tuple(stage.message.values + e[DIM:] for stage, e in zip(gone, means, strict=True)),
+            sigma=tuple(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)) for P in found),
+        )
 
 
 class Window:
@@ -227,7 +246,7 @@ class Window:
         return self._leaving.step(most)
 
     def _begin_leaving(self, count: int) -> Leaving:
-        return _Covariances(self.stages, count)
+        return _Covariances(self, count)
 
     @property
     def leaving(self) -> int:
@@ -235,37 +254,18 @@ class Window:
         return 0 if self._leaving is None else self._leaving.count
 
     def settle(self, count: int) -> SettledStates:
-        """Smooth the window and marginalise its first `count` stages."""
-        gone, means, back = self.stages[:count], self.compute_means()[1 : count + 1], self._leaving
-        if not isinstance(back, _Covariances) or back.count != count:
-            back = _Covariances(self.stages, count)
-        back.step(len(self.stages))
-        self._revision, self._leaving, self._rounds = None, None, 0
-        columns = tuple(stage.message.columns for stage in gone)
-        rows, covariance, sigma = [], np.empty((len(gone), DIM, DIM)), []
-        for k, (stage, P) in enumerate(zip(gone, reversed(back.found), strict=True)):
-            rows.append(stage.message.state)
-            covariance[k] = P[:DIM, :DIM]
-            sigma.append(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)))
-        values = tuple(stage.message.values + e[DIM:] for stage, e in zip(gone, means, strict=True))
-        states = self.head.state[:0]
-        if gone:
-            moved, states, turns = np.array([e[:DIM] for e in means]), States.stack(rows), gone[-1].message.turns
-            covariance = turn_covariance(covariance, states, moved) if turns else move_covariance(covariance, moved)
-            states = add_error(states, moved, turns)
-            self.head = gone[-1].message
-            del self.stages[:count]
-            self._means = None
-            if not self.stages:
-                self.head = self.head.move(self.head.estimate)
-        return SettledStates(
-            t=np.array([stage.place.t for stage in gone]),
-            states=states,
-            covariance=covariance,
-            columns=columns,
-            values=values,
-            sigma=tuple(sigma),
-        )
+        """Smooth the window and marginalise its first `count` stages, 1 or more."""
+        started = self._leaving
+        settled = (started if started and started.count == count else self._begin_leaving(count)).settle()
+        self._revision, self._leaving, self._means, self._rounds = None, None, None, 0
+        self.head = self.stages[count - 1].message
+        del self.stages[:count]
+        self._marginalise(count)
+        return settled
+
+    def _marginalise(self, count: int) -> None:
+        if not self.stages:
+            self.head = self.head.move(self.head.estimate)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def find_first_moved(self, share: float = 1.0) -> int | None:
