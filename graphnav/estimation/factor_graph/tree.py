@@ -41,11 +41,10 @@ from graphnav.estimation.factor_graph.tree_nodes import (
     make_interval_factor,
     make_isam,
     make_row_factor,
-    read_factors,
     read_states,
+    rebuild_isam,
     take_deltas,
     update_isam,
-    write_factors,
 )
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import Step, shift
@@ -324,12 +323,12 @@ class Tree:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the tree itself, which is made again from its factors."""
-        return {**self.__dict__, "isam": write_factors(self.isam, self.variables.values())}
+        return {**self.__dict__, "isam": self.isam.getFactorsUnsafe().serialize()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        rows = state.pop("isam")
+        factors = state.pop("isam")
         self.__dict__.update(state)
-        self.isam, now = read_factors(rows, {x: x.last for x in self.variables.values()})
+        self.isam, now = rebuild_isam(factors, {x: x.last for x in self.variables.values()})
         for k in self.keyframes:
             k.slots = {name: now[i] for name, i in k.slots.items()}
 
