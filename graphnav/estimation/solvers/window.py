@@ -31,7 +31,7 @@ from graphnav.estimation.solvers.stages import (
     add_error,
     count_columns,
     forget_rows,
-    linearise_rows,
+    linearise_keyframes,
     pad,
     predict_stage,
 )
@@ -155,7 +155,7 @@ class Window:
     def expect(self, place: Place) -> Predicted:
         """Predict a keyframe, linearised at its prediction, with the rows that are available already."""
         state, values, columns, link = predict_stage(self.newest, place)
-        rows = linearise_rows(place, state, values, columns, late=False).measured
+        rows = linearise_keyframes([place], state, [values], columns, linked=False, late=False)[0].measured
         return predict_message(self.newest, place, link, rows, state, values, columns)
 
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
@@ -171,9 +171,8 @@ class Window:
     @staticmethod
     def _update(ahead: Predicted) -> tuple[Stage, Array]:
         """A keyframe with all its rows, about its prediction, and the error state (D,) that is most likely there."""
-        return update_late(
-            ahead, linearise_rows(ahead.place, ahead.state, ahead.values, ahead.columns, late=True).measured
-        )
+        point = [ahead.place], ahead.state, [ahead.values], ahead.columns
+        return update_late(ahead, linearise_keyframes(*point, linked=False, late=True)[0].measured)
 
     def _append(self, stage: Stage) -> None:
         self.stages.append(stage)
