@@ -319,11 +319,11 @@ def test_linearised_again_in_portions_it_is_the_same(built: Problem) -> None:
     np.testing.assert_allclose(changed[1], sd, rtol=1e-3)
 
 
-@pytest.mark.parametrize("slope", [1.0, 1.9, 2.0, 3.5])
+@pytest.mark.parametrize("slope", [1.0, 1.6, 2.0, 3.5])
 def test_relaxed_steps_end_at_the_optimum_where_whole_ones_swing_around_it(slope: float) -> None:
     """Steps -slope x to an optimum at 0: from slope 2 on whole ones never come closer."""
     x, relaxation = np.tile([0.03, -0.01, 0.02], (7, 1)), Relaxation()
-    for _ in range(3):
+    for _ in range(4):
         step = -slope * x
         x = x + relaxation.find_share(step) * step
     assert np.abs(x).max() < 1e-12

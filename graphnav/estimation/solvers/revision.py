@@ -29,6 +29,8 @@ from graphnav.estimation.solvers.stages import (
 if TYPE_CHECKING:
     from graphnav.estimation.solvers.window import Window
 
+_SWING = 0.5  # of a step, by which the next goes back
+
 Renewed = Callable[[int, int], Sequence[Place]]
 Renewing = Callable[[int, int], Sequence[Place] | None]  # None where it wants to be asked again at the next step
 
@@ -36,20 +38,25 @@ Renewing = Callable[[int, int], Sequence[Place] | None]  # None where it wants t
 class Relaxation:
     """How much of each step of Gauss and Newton to take, so that they do not swing around the optimum.
 
-    Steps e, e' from points that are d apart show by how much a step shrinks on the way: with
-    s = (e - e') d / d^2 the next one ends at 1/s of it (Aitken's method: Irons and Tuck 1969), the whole at most.
+    Steps e, e' from points that are d apart tell how much of e' is too much: with s = (e - e') d / d^2 it ends at 1/s
+    of it (Aitken's method: Irons and Tuck 1969). What swings to less than `_SWING` of what it was is left to whole
+    steps, which end at once where nothing swings. The first step tells nothing: its rows were linearised elsewhere.
     """
 
     def __init__(self) -> None:
-        self._last, self._share = np.empty((0, 3)), 1.0
+        self._last: Array | None = None
+        self._share = 1.0
 
     def find_share(self, step: Array) -> float:
         """The share of a step to take, by its turns of n attitudes (n, 3)."""
+        if self._last is None:
+            self._last = step[:0]
+            return 1.0
         n = min(len(step), len(self._last))
         gone = self._share * self._last[:n]
         square = float(np.sum(gone**2))
-        shrinks = float(np.sum((self._last[:n] - step[:n]) * gone)) / square if square > 0.0 else 1.0
-        self._last, self._share = step, min(1.0, 1.0 / shrinks) if shrinks > 0.0 else 1.0
+        slope = float(np.sum((self._last[:n] - step[:n]) * gone)) / square if square > 0.0 else 1.0
+        self._last, self._share = step, 1.0 / slope if slope > 1.0 + _SWING else 1.0
         return self._share
 
 

@@ -130,7 +130,7 @@ class Window:
         self._means: list[Array] | None = None
         self._revision: Revision | None = None
         self._rounds = 0  # of it
-        self._relaxation = Relaxation()  # of these
+        self._relaxation = Relaxation()  # of these, and of earlier ones while they do not converge
 
     def __len__(self) -> int:
         return len(self.stages)
@@ -257,6 +257,7 @@ class Window:
         started = self._leaving
         settled = (started if started and started.count == count else self._begin_leaving(count)).settle()
         self._revision, self._leaving, self._means, self._rounds = None, None, None, 0
+        self._relaxation = Relaxation()
         self.head = self.stages[count - 1].message
         del self.stages[:count]
         self._marginalise(count)
@@ -333,10 +334,10 @@ class Window:
         if self._revision is None:
             first = self._find_first_again(share, always and not self._rounds)
             if first is None or self._rounds == _MAX_RELINEARISATIONS:
+                if first is None:
+                    self._relaxation = Relaxation()
                 self._rounds = 0
                 return False
-            if not self._rounds:
-                self._relaxation = Relaxation()
             step = np.array([e[:3] for e in self.compute_means()[1:]])
             step[:first] = 0.0
             self._rounds += 1
