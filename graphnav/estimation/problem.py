@@ -20,7 +20,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.clipping import restore_peaks
 from graphnav.imu.dynamics import ImuFactors, make_scale_parameter
-from graphnav.imu.preintegration import Intervals, preintegrate, preintegrate_unknown
+from graphnav.imu.preintegration import Intervals, list_unknown, preintegrate, preintegrate_unknown
 from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.imu.unresolved import add_coning, add_unresolved_motion
 from graphnav.recording import ImuNoise, Recording
@@ -166,7 +166,8 @@ def build_problem(
         epochs = np.concatenate([*wanted, np.empty(0)])
         times = choose_keyframes(recording.start, recording.end, epochs, settings.keyframes.rate)
     t = times
-    samples = bridge_gaps(recording.imu, float(t[0]))
+    before = {end: one.intervals for end, one in (known or {}).items()}
+    samples = bridge_gaps(recording.imu, float(t[min(list_unknown(t, before), default=-1)]))
     remarks: tuple[str, ...] = ()
     if recording.platform == "foot":
         samples, remarks = restore_peaks(samples, recording.imu.R_bs, highest)
@@ -174,7 +175,6 @@ def build_problem(
         samples = add_coning(samples) if settings.imu.coning else samples
     motion = known.get(float(t[1])) if known and len(t) == 2 else None
     if motion is None or motion.intervals.t0[0] != t[0]:
-        before = {end: one.intervals for end, one in (known or {}).items()}
         intervals = preintegrate_unknown(samples, recording.imu, t, start.ba[0], start.bg[0], before, parts_of_noise)
         motion = ImuFactors(intervals, frame)
     intervals = motion.intervals

@@ -210,7 +210,7 @@ class ImuFactors:
         return np.linalg.inv(np.linalg.cholesky(self.intervals.covariance))
 
     def propagate(self, rows: slice, start: States, scale: Array | None = None) -> tuple[States, Array]:
-        """Propagate states to the ends of intervals `rows`, with F (n, 15, 15).
+        """Propagate states to the ends of intervals `rows`, with F (n, 15, 15 + k): by the states and by scale errors.
 
         `scale` is (k,), (n, k) or None.
         """
@@ -227,7 +227,12 @@ class ImuFactors:
         F[:, 3:9, 3:9] = self.inner[rows]
         F[:, 3:9, 9:15] = turned @ self.bias[rows, 3:]
         F[:, 9:15, 9:15] = _I6
-        return end, F
+        if scale is None:
+            return end, F
+        # the bias columns, times what the scale errors multiply
+        S, (force, rate) = np.zeros((n, DIM, scale.shape[-1])), self.inputs
+        S[:, :9] = differentiate_by_scale(F[:, :9, 12:15], F[:, :9, 9:12], force[rows], rate[rows], S.shape[2])
+        return end, np.concatenate([F, S], axis=2)
 
     def advance(self, rows: slice, start: States, scale: Array | None = None) -> States:
         """The states of `propagate` alone."""
@@ -261,12 +266,6 @@ class ImuFactors:
         """(n, 6, 6) from (dP, dV) in the start's body axes to (p, v) at the end."""
         return (self.post[rows].reshape(-1, 6, 2, 3) @ R_nb[:, None]).reshape(-1, 6, 6)
 
-    def scale_columns(self, rows: slice, F: Array, k: int) -> Array:
-        """d(end) / d(scale), (n, 15, k): the bias columns of F times what the scale errors multiply."""
-        out, (force, rate) = np.zeros((len(F), DIM, k)), self.inputs
-        out[:, :9] = differentiate_by_scale(F[:, :9, 12:15], F[:, :9, 9:12], force[rows], rate[rows], k)
-        return out
-
     def compute_frames(self, rows: slice, R_nb: Array) -> Array:
         """(n, 15, 15) from the frames of `Intervals.covariance` to the error state at the end."""
         n = len(R_nb)
@@ -295,11 +294,9 @@ class ImuFactors:
         r = states[1:].minus(ahead)
         r_theta = r[:, :3]
         inverse = rotation.right_jacobian_inverse(r_theta)
-        S = self.scale_columns(rows, F, 0 if scale is None else scale.shape[-1])
-        both = -np.concatenate([F, S], -1)
+        both = -F
         both[:, :3] = inverse @ rotation.exp(-r_theta) @ both[:, :3]
-        Jj = np.zeros_like(F)
-        Jj[:] = np.eye(DIM)
+        Jj = np.tile(np.eye(DIM), (len(F), 1, 1))
         Jj[:, :3, :3] = inverse
         value = self._rotate(r, start.R_nb)
         both, Jj = self.rotate_to_body(both, start.R_nb), self.rotate_to_body(Jj, start.R_nb)

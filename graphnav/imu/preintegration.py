@@ -160,6 +160,11 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array, par
     return Intervals(**out)
 
 
+def list_unknown(t: Array, known: Mapping[float, Intervals]) -> list[int]:
+    """The intervals between keyframes t that are not in `known`, by their end times."""
+    return [k for k, end in enumerate(t[1:].tolist()) if end not in known or known[end].t0[0] != t[k]]
+
+
 def preintegrate_unknown(
     samples: Samples,
     imu: Imu,
@@ -170,7 +175,7 @@ def preintegrate_unknown(
     parts_of_noise: bool = False,
 ) -> Intervals:
     """`preintegrate`, except for intervals that are in `known` already, by their end times."""
-    missing = [k for k, end in enumerate(t[1:].tolist()) if end not in known or known[end].t0[0] != t[k]]
+    missing = list_unknown(t, known)
     if len(missing) == len(t) - 1:
         return preintegrate(samples, imu, t, ba, bg, parts_of_noise)
     parts = {k: known[float(t[k + 1])] for k in range(len(t) - 1) if k not in missing}

@@ -46,11 +46,11 @@ def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors, noise: 
             intervals = intervals.with_noise(factors)
         motion, one = ImuFactors(intervals, frame), slice(0, 1)
         scale = newest.get_value(SCALE) if SCALE in newest.columns else None
-        ahead, F15 = motion.propagate(one, state, scale)
+        ahead, by_both = motion.propagate(one, state, scale)
         F = np.zeros((DIM, len(P)))
-        F[:, :DIM] = F15[0]
+        F[:, :DIM] = by_both[0, :, :DIM]
         if scale is not None:
-            F[:, newest.columns[SCALE]] = motion.scale_columns(one, F15, len(scale))[0]
+            F[:, newest.columns[SCALE]] = by_both[0, :, DIM:]
         P = F @ P @ F.T + motion.compute_noise(one, state.R_nb)[0]
         state = ahead
     return Live(float(max(now, T)), state, P[:DIM, :DIM], T)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from graphnav.core.findings import find_gap_limit
 from graphnav.core.rotation import Array
 from graphnav.online.looks import CONTEXT
@@ -15,12 +17,12 @@ ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints use where 
 def cut_around(sensors: Sensors, begin: float, end: float) -> Recording:
     """The rows that keyframes between two times (s) use.
 
-    Only what fills gaps of the IMU depends on the signal of the last half minute.
+    A gap of the IMU is filled by all of its rows that are kept: half a minute may have no turn like the one it is in.
     """
     near = sensors.make_recording(begin - ROWS_BEFORE, end)
     t = near.imu.t
     whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < find_gap_limit(t)
-    return near if whole else sensors.make_recording(begin - CONTEXT, end)
+    return near if whole else replace(sensors.make_recording(begin - CONTEXT, end), imu=sensors.make_imu(end=end))
 
 
 def compute_error_units(sensors: Sensors, recording: Recording) -> Array | None:

@@ -68,8 +68,8 @@ class Neighbours:
         """Whether the sensor is stuck, by the newest rows."""
         return self._frozen is not None
 
-    def is_frozen(self, t: float, values: tuple[float, ...]) -> bool:
-        """Whether a new row repeats, once more, what a stuck sensor has repeated before."""
+    def skip_frozen(self, t: float, values: tuple[float, ...]) -> bool:
+        """Count a new row, and return True, if it repeats once more what a stuck sensor has repeated before."""
         if self._frozen is None:
             return False
         if values != self._frozen:

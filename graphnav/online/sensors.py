@@ -25,7 +25,7 @@ from graphnav.online.sanity import (
     drop_insane_velocity,
     find_fix_fault,
 )
-from graphnav.recording import Odometer, Recording
+from graphnav.recording import Imu, Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
 
 AHEAD = 60.0  # s; stamps of other sensors that are further before the IMU's are wrong
@@ -296,7 +296,7 @@ class Sensors:
         return None if reads else "beyond any sensor"
 
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
-        if t > self.imu.newest and self._neighbours.is_frozen(t, values):
+        if t > self.imu.newest and self._neighbours.skip_frozen(t, values):
             self.counts[f"imu: {FILLED}"] += 1
             return False
         if t <= self.oldest or (t < self.imu.newest - SAME and not self._clock.fits(t, self.imu.t)):
@@ -368,10 +368,13 @@ class Sensors:
         rows = self.imu.t
         return float(rows[min(int(np.searchsorted(rows, t - SAME)), len(rows) - 1)]) if len(rows) else t
 
+    def make_imu(self, begin: float = -np.inf, end: float = np.inf) -> Imu:
+        """The rows of the IMU between two times, s."""
+        rows = self.imu.copy_between(begin, end)
+        return replace(self.setup.imu, t=rows[:, 0], gyro=rows[:, 1:4], accel=rows[:, 4:7])
+
     def make_recording(self, begin: float = -np.inf, end: float = np.inf, every: bool = False) -> Recording:
         """The rows between two times as a recording; with `every` also the fixes that are not used."""
-        rows = self.imu.copy_between(begin, end)
-        imu = replace(self.setup.imu, t=rows[:, 0], gyro=rows[:, 1:4], accel=rows[:, 4:7])
         sensors = {}
         for name, buffer in self.others.items():
             rows = buffer.copy_between(begin, end)
@@ -379,7 +382,7 @@ class Sensors:
         raw = None if self.raw is None else self.raw.build_between(begin, end)
         return replace(
             self.setup,
-            imu=imu,
+            imu=self.make_imu(begin, end),
             gnss=self.gnss.select_as_gnss(begin, end, every),
             odometer=self._make_odometer(begin, end),
             sensors=sensors,

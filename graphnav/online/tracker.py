@@ -31,6 +31,7 @@ from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.elimination import Predicted
+from graphnav.estimation.solvers.incremental import are_due
 from graphnav.estimation.solvers.stages import Message, Place, forget_rows
 from graphnav.estimation.solvers.window import SettledStates
 from graphnav.imu.dynamics import ImuFactors
@@ -46,7 +47,6 @@ from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
 
 _REBUILT_BEFORE = 6  # keyframes built again with a new one in a stop, so that the stop is recognised
-_PORTIONS = 8  # of the lag: keyframes settle in groups of this duration
 _SMOOTHED = 8  # covariances smoothed in the time of one relinearisation
 _LATEST_SETTLING = 0.5  # of the lag by which settling may be delayed while states still move
 
@@ -180,7 +180,7 @@ class Tracker(Chain):
                 self._settle(self.newest - lag)
         elif settling and self.window.leaving:
             self._settle(self.newest - lag)
-        elif settling and self._tried < self.newest and self.newest - self._oldest > lag * (1.0 + 1.0 / _PORTIONS):
+        elif settling and self._tried < self.newest and are_due(self._oldest, self.newest, lag):
             self._tried, self._settling = self.newest, True
             if not self.revise(sensors, always={self.settings.gnss.kernel, self.settings.vehicle.kernel} != {"none"}):
                 self._settle(self.newest - lag)
@@ -206,8 +206,9 @@ class Tracker(Chain):
         """Integrate the interval up to the expected keyframe."""
         T, start = self.newest, self.window.newest.state
         imu = cut_around(sensors, T, sensors.imu.newest).imu
-        ends = np.array([T, expected])
-        interval = preintegrate(bridge_gaps(imu, T), imu, ends, start.ba[0], start.bg[0], self._estimates_imu)
+        samples, ends = bridge_gaps(imu, T), np.array([T, expected])
+        self._note_gaps(samples.bridged[:, 1])
+        interval = preintegrate(samples, imu, ends, start.ba[0], start.bg[0], self._estimates_imu)
         self._motions[expected] = ImuFactors(interval, self.frame).prepare()
 
     def _is_covered(self, sensors: Sensors, t: float) -> bool:

@@ -27,6 +27,7 @@ from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import Incremental, incremental
 from graphnav.estimation.solvers.linearise import Step, list_node_steps
+from graphnav.estimation.solvers.revision import Relaxation
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stages import Message, Place, rotate_columns
 from graphnav.estimation.solvers.window import Window, make_first_message
@@ -316,3 +317,13 @@ def test_linearised_again_in_portions_it_is_the_same(built: Problem) -> None:
     np.testing.assert_allclose(at_once[1], sd, rtol=1e-7)
     np.testing.assert_allclose(changed[0] / sd, off / sd, atol=0.02)
     np.testing.assert_allclose(changed[1], sd, rtol=1e-3)
+
+
+@pytest.mark.parametrize("slope", [1.0, 1.6, 2.0, 3.5])
+def test_relaxed_steps_end_at_the_optimum_where_whole_ones_swing_around_it(slope: float) -> None:
+    """Steps -slope x to an optimum at 0: from slope 2 on whole ones never come closer."""
+    x, relaxation = np.tile([0.03, -0.01, 0.02], (7, 1)), Relaxation()
+    for _ in range(4):
+        step = -slope * x
+        x = x + relaxation.find_share(step) * step
+    assert np.abs(x).max() < 1e-12

@@ -19,12 +19,7 @@ from graphnav.core.state import DIM, States
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
-from graphnav.estimation.factor_graph.tree_marginals import (
-    begin_elimination,
-    eliminate,
-    find_head,
-    settle,
-)
+from graphnav.estimation.factor_graph.tree_marginals import Elimination, find_head
 from graphnav.estimation.factor_graph.tree_nodes import update_isam
 from graphnav.estimation.factor_graph.tree_window import TreeWindow, isam2
 from graphnav.estimation.noise.apply import apply_noise
@@ -230,9 +225,9 @@ def test_what_leaves_takes_no_parameter_along_that_is_in_force(built: Problem) -
     count = int(np.searchsorted(built.t, 12.0))
     order = [(x, 0 if x is stop else 1 + x.last) for x in tree.variables.values()]
     update_isam(tree.isam, float(built.t[39]), order=order, anew=tree.variables.values())
-    before = settle(tree, begin_elimination(tree, len(tree), count))
+    before = Elimination(tree, len(tree), count).settle()
     tree.marginalise(count)
-    after = settle(tree, begin_elimination(tree, len(tree)))
+    after = Elimination(tree, len(tree)).settle()
     sd = np.sqrt(np.diagonal(before.covariance, axis1=1, axis2=2))
     scale = sd[:, :, None] * sd[:, None]
     np.testing.assert_allclose(after.covariance / scale, before.covariance / scale, atol=1e-6)
@@ -319,14 +314,15 @@ def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(built: Pro
     window.settle(20)
     tree = window.tree
     for again in (False, True):
-        leaving, count = eliminate(tree, begin_elimination(tree, 6), 20), 6
+        leaving, count = Elimination(tree, 6), 6
+        assert not leaving.step(20)
         if again:
-            tree.linearise_again(range(3, len(tree)))
+            tree.linearise_again(range(3, len(tree)), lambda a, b: [stage.place for stage in window.stages[a:b]])
         expected = [tree.isam.marginalCovariance(k.state.key) for k in tree.keyframes[:count]]
         unit = tree.keyframes[0].state.unit
         if not again:
             fill(window, built, 60, 61)
-        found = settle(tree, leaving)
+        found = leaving.settle()
         delta = np.array([k.state.delta for k in tree.keyframes[:count]])
         own = move_covariance(unit[:, None] * np.array(expected) * unit, delta)
         for a, b in zip(found.covariance, own, strict=True):

@@ -23,8 +23,8 @@ from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
-from graphnav.estimation.solvers.linearise import Points, advance, linearise
-from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter, predict_states
+from graphnav.estimation.solvers.linearise import Points, advance, linearise, scale_at
+from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter
 from graphnav.estimation.solvers.recursion import move_columns
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Stack
@@ -82,7 +82,8 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(built:
         def ahead(e: Array, k: int = k) -> Array:
             at, to = slice(k - 1, k), slice(k, k + 1)
             values = points.values[at] + e[DIM:]
-            reached, _ = predict_states(built, at, points.states[at].plus(e[None, :DIM]), values)
+            scale = scale_at(built.columns, values)
+            reached, _ = built.motion.propagate(at, points.states[at].plus(e[None, :DIM]), scale)
             return np.concatenate([reached.minus(points.states[to]), steps.predict(at, values) - points.values[to]], 1)[
                 0
             ]

@@ -63,7 +63,7 @@ def test_transition_numerically(motion: ImuFactors, start: States, scale: Array 
 
     numerical = difference(moved, STEPS)
     # gravity's gradient is that at the origin, on a sphere: 1e-7 1/s^2, and the intervals last up to 4 s
-    assert np.all(np.abs(F - numerical) < 1e-6 * sizes(numerical) + 2e-7)
+    assert np.all(np.abs(F[:, :, :DIM] - numerical) < 1e-6 * sizes(numerical) + 2e-7)
 
 
 @pytest.mark.parametrize("scale", [SCALES, SQUARE], ids=["scales", "square"])
@@ -72,8 +72,7 @@ def test_scale_columns_numerically(motion: ImuFactors, start: States, scale: Arr
     numerical = difference(
         lambda d: motion.propagate(slice(None), start, scale + d)[0].minus(end), np.full(len(scale), 1e-4)
     )
-    S = motion.scale_columns(slice(None), F, len(scale))
-    assert np.all(np.abs(S - numerical) < 3e-6 * sizes(numerical, triads(scale)) + 2e-7)
+    assert np.all(np.abs(F[:, :, DIM:] - numerical) < 3e-6 * sizes(numerical, triads(scale)) + 2e-7)
 
 
 def test_slices_are_rows_of_the_whole(motion: ImuFactors, start: States) -> None:

@@ -45,6 +45,27 @@ def test_what_fills_a_gap_of_the_imu_is_not_taken_for_a_fault_of_the_fixes_behin
     assert not left_out
 
 
+@pytest.mark.parametrize("engine", ["window", "isam2"])
+def test_sigmas_at_once_are_true_behind_a_gap_of_the_imu_in_an_outage(engine: str) -> None:
+    """A second and a half in a turn: whole Gauss-Newton steps swing by degrees, and each makes sigmas smaller."""
+    whole = load("kitti").crop(171.4, 230.5)
+    recording, squares = whole.without("gnss", (40.0, 60.0)), []
+    online, newest = Online(drop_rows(recording), parse_settings({"vehicle": {"nhc": True}}), engine), -np.inf
+    assert whole.gnss is not None
+    for row in list_rows(recording)[1]:
+        online.add(row)
+        tracker = online.tracker
+        if tracker is None or tracker.newest <= newest:
+            continue
+        newest, message = tracker.newest, tracker.window.newest
+        k = int(np.argmin(np.abs(whole.gnss.t - newest)))
+        if newest > recording.start + 46.0 and abs(whole.gnss.t[k] - newest) < 0.02:
+            off = message.state.p[0] - tracker.frame.from_llh(whole.gnss.llh[k][None])[0]
+            squares.append(off @ np.linalg.solve(message.covariance[3:6, 3:6], off) / 3.0)
+    assert len(squares) > 4
+    assert np.mean(squares) < 6.0  # fixes are off, too
+
+
 def play(recording: Recording) -> Online:
     """Without another estimate of the noise model than that from the rows of the alignment."""
     online = Online(drop_rows(recording), parse_settings({"gnss": {"velocity": False}, "solver": {"lag": 60.0}}))

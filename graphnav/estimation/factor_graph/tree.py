@@ -41,15 +41,14 @@ from graphnav.estimation.factor_graph.tree_nodes import (
     make_interval_factor,
     make_isam,
     make_row_factor,
-    read_estimates,
-    read_factors,
     read_states,
+    rebuild_isam,
+    take_deltas,
     update_isam,
-    write_factors,
 )
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import Step, shift
-from graphnav.estimation.solvers.revision import Renewed, linearise_runs
+from graphnav.estimation.solvers.revision import Relaxation, Renewed, linearise_runs
 from graphnav.estimation.solvers.stages import (
     Measured,
     Message,
@@ -109,7 +108,7 @@ class Tree:
         x = self._add_variable(np.zeros(DIM), _UNIT, place.t)
         nodes = self._open(place, fresh)
         names = frozenset(one.name for one in rows)
-        keyframe = Keyframe(self._number, place, x, ahead.state, columns, nodes, names)
+        keyframe = Keyframe(self._number, place.t, x, ahead.state, columns, nodes, names)
         for node, _ in nodes.values():
             node.last = self._number
         keyframe.put(ahead.state, ahead.values)
@@ -135,8 +134,8 @@ class Tree:
         # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
         most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
         order = [(v, max(v.last - keyframe.number + most, 0)) for v in self._find_recent()]
-        self._update(made, fresh=fresh, order=order)
-        keyframe.read(self.isam)
+        update_isam(self.isam, place.t, made, fresh=fresh, order=order)
+        take_deltas(self.isam, keyframe.variables)  # in the root, or eliminated just now
 
     def _add_first_keyframe(self, place: Place) -> None:
         """Add the initial message as a keyframe before the first."""
@@ -155,12 +154,11 @@ class Tree:
                 self._constant.add(name)
                 self._first_sigma[name] = p.sigma
         self._in_force = nodes
-        before = Place(place.t, None)
-        self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, frozenset()))
-        self._update(fresh=[*fresh, (x, make_factor(blocks, prior.z))])
+        self.keyframes.append(Keyframe(self._number, place.t, x, prior.state, prior.columns, nodes, frozenset()))
+        update_isam(self.isam, place.t, fresh=[*fresh, (x, make_factor(blocks, prior.z))])
         self._number += 1
         self.held = 1
-        self.keyframes[0].read(self.isam)
+        take_deltas(self.isam, self.keyframes[0].variables)
 
     def _find_recent(self) -> Iterable[Variable]:
         for keyframe in self.keyframes[-3:]:
@@ -210,12 +208,6 @@ class Tree:
         self._in_force = in_force
         return in_force
 
-    def _update(
-        self, made: Sequence[Made] = (), gone: Sequence[int] = (), fresh: Sequence[Fresh] = (), **how: Any
-    ) -> None:
-        """As `update_isam`."""
-        update_isam(self.isam, self.keyframes[-1].place.t, made, gone, fresh, **how)
-
     def _enter(self) -> None:
         """Take in the keyframes of a whole drive that wait."""
         (made, fresh), self._waiting = self._waiting, ([], [])
@@ -230,13 +222,14 @@ class Tree:
         if every:
             late, first = list(self.variables.values()), self.keyframes[0].number
         order = [(v, v.last - first) for v in late]
-        self._update(made, gone, fresh, order=order, anew=late if every else None)
+        update_isam(self.isam, self.keyframes[-1].t, made, gone, fresh, order, late if every else None)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:
         """Bring all estimates up to date."""
         self._enter()
-        read_estimates(self.isam, self.variables.values())
+        self.isam.calculateBestEstimate()  # by back-substitution through the whole tree
+        take_deltas(self.isam, self.variables.values())
 
     def find_moves(self) -> Array:
         """(K,) how far keyframes' estimates are from where their rows were linearised, 1 at the limit."""
@@ -252,19 +245,28 @@ class Tree:
         moves[: self.held] = 0.0
         return moves
 
-    def relinearise(self, share: float = 1.0, renewed: Renewed | None = None) -> int:
+    def relinearise(self, share: float, renewed: Renewed, relaxation: Relaxation) -> int:
         """Relinearise keyframes that have moved beyond a share of the limits; returns their number."""
         self.read()
         moves = self.find_moves()
         if not (moves > share).any():
             return 0
         which = np.flatnonzero(moves > _ALMOST * share)
+        step = np.zeros((len(self), 3))
+        own = [self.keyframes[i] for i in which]
+        step[which] = [k.state.delta[:3] - k.state.point[:3] for k in own]
+        part = relaxation.find_share(step)
+        for x in {x.key: x for k in own for x in k.variables}.values() if part < 1.0 else ():
+            x.delta = x.point + part * (x.delta - x.point)
         self.linearise_again(which, renewed)
         self.read()
         return len(which)
 
-    def linearise_again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
-        """Linearise keyframes, and the intervals on either side, where they are now."""
+    def linearise_again(self, which: Iterable[int], renewed: Renewed) -> None:
+        """Linearise keyframes, and the intervals on either side, where they are now.
+
+        `renewed` returns the places of those from one index to another, which count from those held on.
+        """
         rows = {i for i in map(int, which) if i >= self.held}
         if not rows:
             return
@@ -273,9 +275,7 @@ class Tree:
         made: list[Made] = []
         for run in group_runs(sorted(rows | links), lambda last, i: i == last + 1):
             first, own = run[0], self.keyframes[run[0] : run[-1] + 1]
-            places = [k.place for k in own]
-            if renewed is not None:
-                places = list(renewed(first - self.held, first - self.held + len(own)))
+            places = renewed(first - self.held, first - self.held + len(own))
             # the interval before the oldest keyframe is gone
             places = [p if LINK in k.slots else replace(p, linked=False) for p, k in zip(places, own, strict=True)]
             around = [self.keyframes[max(first - 1, 0)], *own]
@@ -321,18 +321,14 @@ class Tree:
         self._replace([], own, last.number)
         self.read()
 
-    def hold(self) -> None:
-        """The first keyframe is behind the window from now on, and stays as it is."""
-        self.held = 1
-
     def __getstate__(self) -> dict[str, Any]:
         """All but the tree itself, which is made again from its factors."""
-        return {**self.__dict__, "isam": write_factors(self.isam, self.variables.values())}
+        return {**self.__dict__, "isam": self.isam.getFactorsUnsafe().serialize()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        rows = state.pop("isam")
+        factors = state.pop("isam")
         self.__dict__.update(state)
-        self.isam, now = read_factors(rows, {x: x.last for x in self.variables.values()})
+        self.isam, now = rebuild_isam(factors, {x: x.last for x in self.variables.values()})
         for k in self.keyframes:
             k.slots = {name: now[i] for name, i in k.slots.items()}
 

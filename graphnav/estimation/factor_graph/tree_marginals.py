@@ -7,8 +7,6 @@ found by eliminating the tree's factors from the other end, the newest first, wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import gtsam
 import numpy as np
 
@@ -17,14 +15,14 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.factor_graph.gaussian import Eliminated
 from graphnav.estimation.factor_graph.tree import Tree
-from graphnav.estimation.factor_graph.tree_nodes import Keyframe, Variable, fill_keys, read_states
+from graphnav.estimation.factor_graph.tree_nodes import Keyframe, fill_keys, read_states
 from graphnav.estimation.solvers.breakdown import explain_undetermined
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.stages import Message
 from graphnav.estimation.solvers.window import SettledStates
 
-_AT_ONCE = 45  # variables: GTSAM's bookkeeping of one elimination grows faster than what it eliminates
+_AT_ONCE = 48  # variables: GTSAM's bookkeeping of one elimination grows faster than what it eliminates
 
 
 def _map_errors(keyframe: Keyframe, J: Array) -> dict[int, Array]:
@@ -82,76 +80,73 @@ def find_head(tree: Tree) -> Message:
     return Message(first.estimate, first.values, first.columns, R[own_rows, own_rows], R[own_rows, -1])
 
 
-@dataclass(frozen=True)
 class Elimination:
-    """Elimination of all later keyframes of a tree, in progress or complete, for the marginal of the oldest."""
-
-    first: int  # keyframes from here
-    count: int  # to here
-    version: int  # of the tree when it began
-    behind: tuple[Variable, ...]  # still to be eliminated
-    own: tuple[Variable, ...]  # those of the keyframes
-    graph: gtsam.GaussianFactorGraph
-    net: gtsam.GaussianBayesNet | None = None  # of the keyframes' own, at the end
-
-
-def begin_elimination(tree: Tree, count: int, first: int = 0) -> Elimination:
-    """Nothing eliminated yet, of the first `count` keyframes, or those of them from `first` on."""
-    tree.read()
-    behind = tree.keyframes[count].number if count < len(tree) else np.inf
-    variables = tree.variables.values()
-    return Elimination(
-        first,
-        count,
-        tree.version,
-        tuple(sorted((x for x in variables if x.first >= behind), key=lambda x: x.first)),
-        tuple(sorted((x for x in variables if x.first < behind), key=lambda x: x.last)),
-        tree.isam.getFactorsUnsafe().linearize(tree.isam.getLinearizationPoint()),
-    )
-
-
-def eliminate(tree: Tree, so_far: Elimination, most: int) -> Elimination:
-    """At most so many variables of the keyframes behind eliminated, and at last those that leave; then it is the same.
+    """Elimination of all keyframes of a tree behind some of the oldest, in portions, for the marginal of these.
 
     Keyframes added since it began do not count; after a relinearisation it starts again.
+
+    Parameters
+    ----------
+    count, first : the keyframes are the first `count`, or those of them from `first` on.
     """
-    if tree.version != so_far.version:
-        so_far = begin_elimination(tree, so_far.count, so_far.first)
-    if so_far.behind:
-        order = fill_keys(gtsam.Ordering(), reversed(so_far.behind[-most:]))
-        graph = so_far.graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
-        return replace(so_far, behind=so_far.behind[:-most], graph=graph)
-    if so_far.net is None:
-        order = fill_keys(gtsam.Ordering(), so_far.own)
-        return replace(so_far, net=so_far.graph.eliminateSequential(order, gtsam.EliminateQR))
-    return so_far
 
+    def __init__(self, tree: Tree, count: int, first: int = 0) -> None:
+        self._tree, self._which, self.count = tree, slice(first, count), count - first
+        self._begin()
 
-def settle(tree: Tree, so_far: Elimination) -> SettledStates:
-    """States and parameters as they are known now, and covariances, all at once of what is left to be done."""
-    own = tree.keyframes[so_far.first : so_far.count]
-    try:
-        while (further := eliminate(tree, so_far, _AT_ONCE)) is not so_far:
-            so_far = further
-    except RuntimeError:  # GTSAM's for a variable that nothing determines
-        raise explain_undetermined(own[0].place.t) from None
-    assert so_far.net is not None
-    tree.read()
-    found = Eliminated(so_far.net).compute_covariances()
-    marginal = {x.key: x.unit[:, None] * found[x.key] * x.unit for x in so_far.own}
-    values, sigma = tuple(k.values for k in own), []
-    for k, known in zip(own, values, strict=True):
-        out = np.zeros(len(known))
-        for name, at in k.columns.items():
-            node, part = k.nodes[name]
-            out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
-        sigma.append(out)
-    about = np.stack([marginal[k.state.key] for k in own])
-    return SettledStates(
-        t=np.array([k.place.t for k in own]),
-        states=read_states(own),
-        covariance=move_covariance(about, np.array([k.state.delta for k in own])),
-        columns=tuple(k.columns for k in own),
-        values=values,
-        sigma=tuple(sigma),
-    )
+    def _begin(self) -> None:
+        tree, end = self._tree, self._which.stop
+        tree.read()
+        self._version = tree.version
+        edge = tree.keyframes[end].number if end < len(tree) else np.inf
+        variables = tree.variables.values()
+        self._behind = sorted((x for x in variables if x.first >= edge), key=lambda x: x.first)
+        self._own = sorted((x for x in variables if x.first < edge), key=lambda x: x.last)
+        self._graph = tree.isam.getFactorsUnsafe().linearize(tree.isam.getLinearizationPoint())
+        self._net: gtsam.GaussianBayesNet | None = None  # of the keyframes' own, at the end
+
+    def step(self, most: int = _AT_ONCE) -> bool:
+        """Eliminate at most so many variables of the keyframes behind, and at last those that leave; True once all
+        is done.
+        """
+        if self._tree.version != self._version:
+            self._begin()
+        if self._behind:
+            portion = slice(-min(most, _AT_ONCE), None)
+            order = fill_keys(gtsam.Ordering(), reversed(self._behind[portion]))
+            self._graph = self._graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
+            del self._behind[portion]
+        elif self._net is None:
+            self._net = self._graph.eliminateSequential(fill_keys(gtsam.Ordering(), self._own), gtsam.EliminateQR)
+        else:
+            return True
+        return False
+
+    def settle(self) -> SettledStates:
+        """States and parameters as they are known now, and covariances, all at once of what is left to be done."""
+        own = self._tree.keyframes[self._which]
+        try:
+            while not self.step():
+                pass
+        except RuntimeError:  # GTSAM's for a variable that nothing determines
+            raise explain_undetermined(own[0].t) from None
+        assert self._net is not None
+        self._tree.read()
+        found = Eliminated(self._net).compute_covariances()
+        marginal = {x.key: x.unit[:, None] * found[x.key] * x.unit for x in self._own}
+        values, sigma = tuple(k.values for k in own), []
+        for k, known in zip(own, values, strict=True):
+            out = np.zeros(len(known))
+            for name, at in k.columns.items():
+                node, part = k.nodes[name]
+                out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
+            sigma.append(out)
+        about = np.stack([marginal[k.state.key] for k in own])
+        return SettledStates(
+            t=np.array([k.t for k in own]),
+            states=read_states(own),
+            covariance=move_covariance(about, np.array([k.state.delta for k in own])),
+            columns=tuple(k.columns for k in own),
+            values=values,
+            sigma=tuple(sigma),
+        )

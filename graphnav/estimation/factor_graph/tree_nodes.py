@@ -41,7 +41,7 @@ class Variable:
 @dataclass(eq=False)
 class Keyframe:
     number: int
-    place: Place
+    t: float  # s
     state: Variable
     anchor: States  # one
     columns: Columns
@@ -74,10 +74,6 @@ class Keyframe:
     def variables(self) -> Collection[Variable]:
         """That its rows may touch, its state first."""
         return {x.key: x for x in (self.state, *(node for node, _ in self.nodes.values()))}.values()
-
-    def read(self, isam: gtsam.ISAM2) -> None:
-        """Bring its variables up to date, where it is the newest: they are in the root, or were eliminated just now."""
-        take_deltas(isam, self.variables)
 
 
 Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, `LINK` or `ROWS`
@@ -145,12 +141,6 @@ def update_isam(
         raise explain_smoother(t) from error
     for (keyframe, name, _), index in zip(made, list(result.getNewFactorsIndices())[begin:], strict=True):
         keyframe.slots[name] = index
-
-
-def read_estimates(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
-    """Bring many variables up to date, by back-substitution through the whole tree."""
-    isam.calculateBestEstimate()
-    take_deltas(isam, variables)
 
 
 def take_deltas(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
@@ -235,33 +225,22 @@ def find_node_limits(columns: Columns, place: Place) -> Array:
     return found if np.isfinite(found).any() else np.zeros(0)
 
 
-def write_factors(isam: gtsam.ISAM2, variables: Iterable[Variable]) -> list[tuple[int, str]]:
-    """The factors of a tree by their indices, as text with all digits."""
-    factors, none = isam.getFactorsUnsafe(), gtsam.Values()
-    for x in variables:
-        none.insert(x.key, np.zeros(len(x.unit)))
-    alive = [i for i in range(factors.size()) if factors.at(i) is not None]
-    return [(i, gtsam.JacobianFactor(factors.at(i).linearize(none)).serialize()) for i in alive]
-
-
-def read_factors(rows: Sequence[tuple[int, str]], order: Mapping[Variable, int]) -> tuple[gtsam.ISAM2, dict[int, int]]:
-    """A tree made from what was written, and where each factor is now.
+def rebuild_isam(text: str, order: Mapping[Variable, int]) -> tuple[gtsam.ISAM2, dict[int, int]]:
+    """A tree made again from its serialised factors, and where each of these is now.
 
     Parameters
     ----------
     order : when each variable is eliminated.
     """
-    isam, graph = make_isam(), gtsam.NonlinearFactorGraph()
+    isam, known, graph = make_isam(), gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    known.deserialize(text)
+    alive = [i for i in range(known.size()) if known.at(i) is not None]
+    for i in alive:
+        graph.push_back(known.at(i))
     new, groups = gtsam.Values(), gtsam.KeyGroupMap()
     first = min(order.values(), default=0)
     for x, number in order.items():
         new.insert(x.key, np.zeros(len(x.unit)))
         groups.insert2(x.key, number - first)
-    for _, text in rows:
-        one = gtsam.JacobianFactor()
-        one.deserialize(text)
-        graph.push_back(gtsam.LinearContainerFactor(one))
-    if not rows:
-        return isam, {}
-    indices = isam.update(graph, new, [], groups).getNewFactorsIndices()
-    return isam, dict(zip((i for i, _ in rows), indices, strict=True))
+    indices = isam.update(graph, new, [], groups).getNewFactorsIndices() if alive else []
+    return isam, dict(zip(alive, indices, strict=True))

@@ -20,25 +20,17 @@ from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.factor_graph.tree import Tree
-from graphnav.estimation.factor_graph.tree_marginals import (
-    Elimination,
-    begin_elimination,
-    compute_newest_root,
-    eliminate,
-    find_head,
-    settle,
-)
+from graphnav.estimation.factor_graph.tree_marginals import Elimination, compute_newest_root, find_head
 from graphnav.estimation.factor_graph.tree_nodes import read_states
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.incremental import Incremental, begin_at, solve_in_turn
-from graphnav.estimation.solvers.revision import Renewing
+from graphnav.estimation.solvers.revision import Relaxation, Renewing
 from graphnav.estimation.solvers.stages import Message, Place, Stage
-from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit
+from graphnav.estimation.solvers.window import Window, compute_turn_limit
 
 _MAX_STEPS = 5
-_COVARIANCE_PORTION = 48  # variables that are eliminated at one row of the IMU for covariances
 _CONVERGED_SHARE = 0.02  # of the usual limits, within which the last window is converged
 # a look at what has moved of a whole drive costs as much as there are keyframes: the next one follows when there are a
 # part in this many more, and at least so many
@@ -58,7 +50,6 @@ class TreeWindow(Window):
         super().__init__(prior, turn)
         self._whole, self._look = whole, _LEAST
         self.tree = Tree(prior, turn, whole)
-        self._leaving: Elimination | None = None  # of stages that are to leave
         self._points: Sequence[Array] = ()  # where `revise` linearises first, error states of the stages
 
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
@@ -91,13 +82,10 @@ class TreeWindow(Window):
         self.tree.read()
         return read_states(self.tree.keyframes[self.tree.held :])
 
-    def find_first_moved(self, share: float = 1.0) -> int | None:
-        """The first stage that the tree would linearise anew; None if there is none."""
-        if not self.stages:
-            return None
-        self.tree.read()
-        moved = self.tree.find_moves() > share
-        return int(np.argmax(moved)) - self.tree.held if moved.any() else None
+    def _find_moves(self) -> Array:
+        if self.stages:
+            self.tree.read()
+        return self.tree.find_moves()[self.tree.held :]
 
     def linearise_at(self, means: Sequence[Array]) -> None:
         """As of `Window`."""
@@ -106,13 +94,13 @@ class TreeWindow(Window):
     def revise(self, count: int, renewed: Renewing | None, always: bool = False, share: float = 1.0) -> bool:
         """As of `Window`, but all at once; False, as nothing is left to do."""
 
-        def renew_at_once(first: int, end: int) -> Sequence[Place]:
-            assert renewed is not None
+        def again(first: int, end: int) -> Sequence[Place]:
+            if renewed is None:
+                return [stage.place for stage in self.stages[first:end]]
             while (places := renewed(first, end)) is None:
                 pass
             return places
 
-        again = None if renewed is None else renew_at_once
         for keyframe, stage, e in zip(self.tree.keyframes[self.tree.held :], self.stages, self._points, strict=False):
             keyframe.put(stage.message.state.plus(e[None, :DIM]), stage.message.values + e[DIM:])
         always, self._points = always or bool(len(self._points)), ()
@@ -120,23 +108,15 @@ class TreeWindow(Window):
             self.tree.linearise_again(range(self.tree.held, len(self.tree)), again)
             self._relinearise_keyframes(len(self))
             share = min(share, _CONVERGED_SHARE)
+        relaxation = Relaxation()
         for _ in range(_MAX_STEPS - always if self.stages else 0):
-            if not (done := self.tree.relinearise(share, again)):
+            if not (done := self.tree.relinearise(share, again, relaxation)):
                 break
             self._relinearise_keyframes(done)
         return False
 
-    def smooth_back(self, count: int, most: int) -> bool:
-        """A part of what `settle` does for the first stages, over at most so many; True once it is done."""
-        if self._leaving is None:
-            self._leaving = begin_elimination(self.tree, self.tree.held + count, self.tree.held)
-        before, self._leaving = self._leaving, eliminate(self.tree, self._leaving, _COVARIANCE_PORTION)
-        return self._leaving is before
-
-    @property
-    def leaving(self) -> int:
-        """How many stages `smooth_back` is about, 0 if it has not begun."""
-        return 0 if self._leaving is None else self._leaving.count - self._leaving.first
+    def _begin_leaving(self, count: int) -> Elimination:
+        return Elimination(self.tree, self.tree.held + count, self.tree.held)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what has been done for stages that are to leave, which is made again."""
@@ -161,23 +141,13 @@ class TreeWindow(Window):
         else:
             self.head = self.head.move(self.head.estimate)
 
-    def settle(self, count: int) -> SettledStates:
-        """Let the first `count` stages go, as the tree knows them."""
-        gone = self.stages[:count]
-        if not gone:
-            return super().settle(0)
-        if self._leaving is None or self.leaving != count:
-            self._leaving = begin_elimination(self.tree, self.tree.held + count, self.tree.held)
-        out, self._leaving = settle(self.tree, self._leaving), None
-        self.head = gone[-1].message
-        del self.stages[:count]
+    def _marginalise(self, count: int) -> None:
         if len(self.tree) > self.tree.held + count:
             self.tree.marginalise(self.tree.held + count - 1)
-            self.tree.hold()
+            self.tree.held = 1
             self.head = replace(find_head(self.tree), tests=self.head.tests)
         else:
             self.tree = Tree(self.head, self.turn, self._whole)
-        return out
 
 
 def _replace_message(stage: Stage, state: States, values: Array, R: Array) -> Stage:

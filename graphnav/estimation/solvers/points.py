@@ -19,15 +19,14 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
+from graphnav.core.state import DIM
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
 from graphnav.estimation.solvers.invariant import turn
-from graphnav.estimation.solvers.linearise import Advance, Columns, Points, Rows, linearise, shift
+from graphnav.estimation.solvers.linearise import Advance, Columns, Points, Rows, linearise, scale_at
 from graphnav.estimation.solvers.passes import Updates
 from graphnav.estimation.solvers.recursion import STRETCH, filter_rows
 from graphnav.estimation.solvers.stack import RowBlock, Stack
-from graphnav.imu.dynamics import SCALE
 
 _STRETCH_AFTER_FAULT = 4  # keyframes that are filtered at once, behind one at which something was found
 Follow = Callable[[int, int], int]  # checks the filtered keyframes from one to another, and returns where to continue
@@ -60,7 +59,7 @@ class Linearisation:
         """At points that stand in the order of the problem's keyframes."""
         n = len(points.values)
         at, begin, end = slice(0, n - 1), points.states[: n - 1], points.states[1:n]
-        ahead, F = predict_states(problem, at, begin, points.values[: n - 1])
+        ahead, F = problem.motion.propagate(at, begin, scale_at(problem.columns, points.values[: n - 1]))
         values = steps.predict(at, points.values[: n - 1])
         gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
         turned = rotation.right_jacobian_inverse(gap[:, :3])
@@ -165,15 +164,6 @@ def _put_rows(linear: Rows, stack: Stack, r: Array, sigma: Array, H: Array) -> N
     """The first rows of a constraint, in their places."""
     k, place = (x[: len(linear.residual)] for x in stack.places[linear.constraint.name])
     r[k, place], sigma[k, place], H[k, place] = linear.residual, linear.stated, linear.H
-
-
-def predict_states(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:
-    """The states at the ends of intervals `at`, and F (n, 15, w) there, by the states and by the scale errors."""
-    scale, motion = problem.columns.get(SCALE), problem.motion
-    if scale is None:
-        return motion.propagate(at, states)
-    ahead, F = motion.propagate(at, states, values[:, shift(scale)])
-    return ahead, np.concatenate([F, motion.scale_columns(at, F, scale.stop - scale.start)], axis=2)
 
 
 def move_covariance(P: Array, e: Array) -> Array:

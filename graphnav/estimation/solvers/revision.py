@@ -29,8 +29,35 @@ from graphnav.estimation.solvers.stages import (
 if TYPE_CHECKING:
     from graphnav.estimation.solvers.window import Window
 
+_SWING = 0.5  # of a step, by which the next goes back
+
 Renewed = Callable[[int, int], Sequence[Place]]
 Renewing = Callable[[int, int], Sequence[Place] | None]  # None where it wants to be asked again at the next step
+
+
+class Relaxation:
+    """How much of each step of Gauss and Newton to take, so that they do not swing around the optimum.
+
+    Steps e, e' from points that are d apart tell how much of e' is too much: with s = (e - e') d / d^2 it ends at 1/s
+    of it (Aitken's method: Irons and Tuck 1969). What swings to less than `_SWING` of what it was is left to whole
+    steps, which end at once where nothing swings. The first step tells nothing: its rows were linearised elsewhere.
+    """
+
+    def __init__(self) -> None:
+        self._last: Array | None = None
+        self._share = 1.0
+
+    def find_share(self, step: Array) -> float:
+        """The share of a step to take, by its turns of n attitudes (n, 3)."""
+        if self._last is None:
+            self._last = step[:0]
+            return 1.0
+        n = min(len(step), len(self._last))
+        gone = self._share * self._last[:n]
+        square = float(np.sum(gone**2))
+        slope = float(np.sum((self._last[:n] - step[:n]) * gone)) / square if square > 0.0 else 1.0
+        self._last, self._share = step, 1.0 / slope if slope > 1.0 + _SWING else 1.0
+        return self._share
 
 
 class Revision:
@@ -39,10 +66,11 @@ class Revision:
     Parameters
     ----------
     means : where they are to be linearised, error states as of `Window.compute_means`, which has the smoothed ones.
+    share : of these, to go.
     """
 
-    def __init__(self, window: Window, first: int, means: Sequence[Array] | None = None) -> None:
-        self.window, self.first, self._means = window, first, means
+    def __init__(self, window: Window, first: int, means: Sequence[Array] | None = None, share: float = 1.0) -> None:
+        self.window, self.first, self._means, self._share = window, first, means, share
         e = self._list_means()[first]
         self._was = window.stages[first - 1] if first else None
         self._stage = None if self._was is None else self._was.move(e)  # the one before, where it is in the window
@@ -51,7 +79,8 @@ class Revision:
         self.made: list[Stage] = []  # their replacements
 
     def _list_means(self) -> Sequence[Array]:
-        return self.window.compute_means() if self._means is None else self._means
+        means = self.window.compute_means() if self._means is None else self._means
+        return means if self._share == 1.0 else [self._share * e for e in means]
 
     def step(self, count: int, renewed: Renewing | None) -> bool:
         """Rebuild at most so many stages; True once they are in place, or no longer wanted.

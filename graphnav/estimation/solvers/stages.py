@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg.lapack import dgesv
 
-from graphnav.constraints.base import Constraint, Linearized
+from graphnav.constraints.base import Linearized
 from graphnav.core import rotation
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array, mv
@@ -233,27 +233,10 @@ def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns
             f"the noise of the IMU before {place.t:.3f} s is zero: check its figures", key="solver.no_imu_noise"
         ) from None
     link = np.zeros((1, DIM, DIM + D + 1))
-    link[:, :, :DIM] = -F
-    link[:, :, DIM : 2 * DIM] = _I
+    link[:, :, :DIM], link[:, :, DIM : 2 * DIM] = -F[:, :, :DIM], _I
     if scale is not None:
-        at = columns[SCALE]
-        link[:, :, DIM + at.start : DIM + at.stop] = -motion.scale_columns(row, F, at.stop - at.start)
+        link[:, :, DIM:][:, :, columns[SCALE]] = -F[:, :, DIM:]
     return ahead, values, columns, (W @ motion.rotate_to_body(link, before.state.R_nb, row))[0]
-
-
-def linearise_rows(place: Place, state: States, values: Array, columns: Columns, late: bool | None = None) -> Linear:
-    """The rows of a keyframe's measurements at a point, without a link; with `late` only those that enter last, or the
-    others."""
-    assert place.problem is not None
-    rows = place.problem.constraints
-    if late is not None:
-        rows = tuple(c for c in rows if enters_last(c) == late)
-    return linearise_keyframes([place], state, [values], columns, linked=False, rows=rows)[0]
-
-
-def enters_last(rows: Constraint) -> bool:
-    """Whether rows enter last: those that depend on later rows, and robust ones, whose weights need an estimate."""
-    return rows.looks_ahead or rows.robust != "none"
 
 
 def pad(rows: Sequence[Array], width: int) -> Array:
@@ -294,12 +277,15 @@ def linearise_keyframes(
     values: Sequence[Array],
     columns: Columns,
     linked: bool = True,
-    rows: Sequence[Constraint] | None = None,
+    late: bool | None = None,
 ) -> list[Linear]:
     """The rows of consecutive keyframes of one problem at given points, all at once.
 
-    `states` and `values` (n, up to D-15) are at the keyframes; with `linked` there is one more of them, the first, at
-    the keyframe before. `rows` are the constraints that are wanted, if not all.
+    Parameters
+    ----------
+    states, values : (n, up to D-15) at the keyframes; with `linked` another, the first, at the keyframe before.
+    late : only rows that enter last, as they depend on later ones, or have a kernel whose weights need an estimate; or
+        only the others.
     """
     problem, first, n = places[0].problem, places[0].k, len(places)
     assert problem is not None
@@ -312,13 +298,12 @@ def linearise_keyframes(
         link = np.zeros((n, DIM, DIM + D + 1))
         link[:, :, :DIM], link[:, :, DIM : 2 * DIM], S, link[:, :, -1] = linearise_links(motion, states, scale)
         if scale is not None:
-            here = columns[SCALE]
-            link[:, :, DIM + here.start : DIM + here.stop] = S
+            link[:, :, DIM:][:, :, columns[SCALE]] = S
         links = list(link)
     parts: list[list[Measured]] = [[] for _ in places]
-    for constraint in problem.constraints if rows is None else rows:
+    for constraint in problem.constraints:
         lo, hi = constraint.keyframe.searchsorted((first, first + n))
-        if lo == hi:
+        if lo == hi or late not in (None, constraint.looks_ahead or constraint.robust != "none"):
             continue
         at = constraint.keyframe[lo:hi] - first + skip
         linear = linearise(constraint, points, columns, slice(lo, hi), at)
@@ -328,22 +313,11 @@ def linearise_keyframes(
         if later:  # rows of satellites that were in view already do not depend on ambiguities that begin later
             begun = ~_depend_on(linear.linear, later)
             at, sigma, H, b, which = (x[begun] for x in (at, sigma, H, b, which))
-        edge = np.searchsorted(at, np.arange(n + 1) + skip)
+        edge, c = np.searchsorted(at, np.arange(n + 1) + skip), constraint
+        kernel = soften(c.robust) if c.robust == "gnc" else c.robust
         for i in np.flatnonzero(np.diff(edge)):
             own = slice(edge[i], edge[i + 1])
-            c = constraint
-            kernel = soften(c.robust) if c.robust == "gnc" else c.robust
-            parts[i].append(
-                Measured(
-                    c.name,
-                    H[own],
-                    b[own],
-                    sigma[own],
-                    kernel,
-                    c.scale_of(which[own]),
-                    c.turns,
-                )
-            )
+            parts[i].append(Measured(c.name, H[own], b[own], sigma[own], kernel, c.scale_of(which[own]), c.turns))
     return [Linear(link, tuple(part)) for link, part in zip(links, parts, strict=True)]
 
 

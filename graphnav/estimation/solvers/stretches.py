@@ -28,12 +28,11 @@ from graphnav.core.state import DIM, MOVING, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
 from graphnav.estimation.solvers.invariant import compute_transport, subtract_invariant, turn
-from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
+from graphnav.estimation.solvers.linearise import Advance, Points, linearise, scale_at
 from graphnav.estimation.solvers.passes import join_passes, move_points
-from graphnav.estimation.solvers.points import allocate_rows, predict_states
+from graphnav.estimation.solvers.points import allocate_rows
 from graphnav.estimation.solvers.recursion import filter_rows, follow_blocks
 from graphnav.estimation.solvers.stack import Stack
-from graphnav.imu.dynamics import SCALE
 
 _SHORTEST, _LONGEST = 16, 256  # keyframes of a stretch
 _MAX_LINEARISATIONS = 10  # iterations of a stretch: each gains two digits or more
@@ -131,11 +130,10 @@ class StretchFilter:
 
     def _guess_points(self, k: int, k1: int, x: Points) -> Points:
         """Prediction by the IMU alone."""
-        first, scale, values = max(k, 1), self._problem.columns.get(SCALE), [x.values[0]]
+        first, values, scale = max(k, 1), [x.values[0]], scale_at(self._problem.columns, x.values[0])
         states = [x.states] if not k else []
         if first < k1:
-            of_scale = None if scale is None else x.values[0, shift(scale)]
-            states.append(self._problem.motion.advance_through(slice(first - 1, k1 - 1), x.states, of_scale))
+            states.append(self._problem.motion.advance_through(slice(first - 1, k1 - 1), x.states, scale))
         for j in range(first, k1):
             values.append(self._steps.predict(j - 1, values[-1]))
         each = self._end[k:k1] - self._start[k:k1] + 1
@@ -199,7 +197,8 @@ class StretchFilter:
         )
         if k:
             before = join_passes([x, before])
-        reached, F = predict_states(self._problem, steps, before.states, before.values)
+        scale = scale_at(self._problem.columns, before.values)
+        reached, F = self._problem.motion.propagate(steps, before.states, scale)
         values = self._steps.predict(steps, before.values)
         gap = np.concatenate([reached.minus(ahead.states), values - ahead.values], axis=1)
         self._F[steps] = F

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from graphnav.estimation.faults.watch import Watch
 from graphnav.estimation.solvers.elimination import Predicted, predict_message, update_late
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.points import move_covariance
-from graphnav.estimation.solvers.revision import Renewed, Renewing, Revision
+from graphnav.estimation.solvers.revision import Relaxation, Renewed, Renewing, Revision
 from graphnav.estimation.solvers.stages import (
     Columns,
     Message,
@@ -30,7 +31,7 @@ from graphnav.estimation.solvers.stages import (
     add_error,
     count_columns,
     forget_rows,
-    linearise_rows,
+    linearise_keyframes,
     pad,
     predict_stage,
 )
@@ -61,25 +62,53 @@ class SettledStates:
         return len(self.t)
 
 
-class _Covariances:
-    """Covariances of the first `count` of some stages, smoothed back from the last a portion at a time."""
+class Leaving(Protocol):
+    """The first `count` stages of a window, to be settled: their covariances come in portions."""
 
-    def __init__(self, stages: Sequence[Stage], count: int) -> None:
-        self.count, self._stages = count, list(stages)
-        self._P = stages[-1].message.covariance if stages else np.empty((0, 0))
-        self.found: list[Array] = []  # (D, D), the last first
+    count: int
 
     def step(self, most: int) -> bool:
-        """Go back over at most so many stages; True once all are known."""
+        """Go on, over at most so many stages; True once all covariances are known."""
+
+    def settle(self) -> SettledStates:
+        """As they are known now, with what is left of the covariances all at once."""
+
+
+class _Covariances:
+    """The first stages of a window, with covariances smoothed back from the newest one."""
+
+    def __init__(self, window: Window, count: int) -> None:
+        self.count, self._window, self._stages = count, window, list(window.stages)
+        self._P = window.newest.covariance
+        self._found: list[Array] = []  # (D, D), the last first
+
+    def step(self, most: int) -> bool:
+        """As of `Leaving`."""
         for _ in range(most):
-            if len(self.found) == self.count:
+            if len(self._found) == self.count:
                 break
             stage = self._stages.pop()
             if len(self._stages) < self.count:
-                self.found.append(self._P)
+                self._found.append(self._P)
             if self._stages:
                 self._P = stage.predict_before(self._P)
-        return len(self.found) == self.count
+        return len(self._found) == self.count
+
+    def settle(self) -> SettledStates:
+        """As of `Leaving`."""
+        self.step(len(self._stages))
+        gone, means = self._window.stages[: self.count], self._window.compute_means()[1 : self.count + 1]
+        states, turns = States.stack([stage.message.state for stage in gone]), gone[-1].message.turns
+        moved, found = np.array([e[:DIM] for e in means]), self._found[::-1]
+        covariance = np.array([P[:DIM, :DIM] for P in found])
+        return SettledStates(
+            t=np.array([stage.place.t for stage in gone]),
+            states=add_error(states, moved, turns),
+            covariance=turn_covariance(covariance, states, moved) if turns else move_covariance(covariance, moved),
+            columns=tuple(stage.message.columns for stage in gone),
+            values=tuple(stage.message.values + e[DIM:] for stage, e in zip(gone, means, strict=True)),
+            sigma=tuple(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)) for P in found),
+        )
 
 
 class Window:
@@ -97,10 +126,11 @@ class Window:
         self.stages: list[Stage] = []
         self.relinearized = 0  # stages made anew
         self._limit: tuple[Columns, Array] = {}, np.empty(0)
-        self._covariances: _Covariances | None = None  # covariances of stages to be settled
+        self._leaving: Leaving | None = None  # stages to be settled
         self._means: list[Array] | None = None
         self._revision: Revision | None = None
         self._rounds = 0  # of it
+        self._relaxation = Relaxation()  # of these, and of earlier ones while they do not converge
 
     def __len__(self) -> int:
         return len(self.stages)
@@ -125,7 +155,7 @@ class Window:
     def expect(self, place: Place) -> Predicted:
         """Predict a keyframe, linearised at its prediction, with the rows that are available already."""
         state, values, columns, link = predict_stage(self.newest, place)
-        rows = linearise_rows(place, state, values, columns, late=False).measured
+        rows = linearise_keyframes([place], state, [values], columns, linked=False, late=False)[0].measured
         return predict_message(self.newest, place, link, rows, state, values, columns)
 
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
@@ -141,9 +171,8 @@ class Window:
     @staticmethod
     def _update(ahead: Predicted) -> tuple[Stage, Array]:
         """A keyframe with all its rows, about its prediction, and the error state (D,) that is most likely there."""
-        return update_late(
-            ahead, linearise_rows(ahead.place, ahead.state, ahead.values, ahead.columns, late=True).measured
-        )
+        point = [ahead.place], ahead.state, [ahead.values], ahead.columns
+        return update_late(ahead, linearise_keyframes(*point, linked=False, late=True)[0].measured)
 
     def _append(self, stage: Stage) -> None:
         self.stages.append(stage)
@@ -170,7 +199,7 @@ class Window:
         if keep >= len(self.stages):
             return
         del self.stages[keep:]
-        self._means = self._covariances = None
+        self._means = self._leaving = None
         if self.stages:
             self.stages[-1] = self.stages[-1].move(self.stages[-1].message.estimate)
         else:
@@ -186,7 +215,7 @@ class Window:
         self.stages[first:] = stages
         if stages:
             self.stages[-1] = self.stages[-1].move(self.stages[-1].message.estimate)
-        self._means = self._covariances = None
+        self._means = self._leaving = None
         self.relinearized += len(stages)
 
     def compute_means(self) -> list[Array]:
@@ -211,55 +240,40 @@ class Window:
 
         Keyframes that arrive meanwhile do not count; when some are removed, it starts again.
         """
-        if self._covariances is None:
-            self._covariances = _Covariances(self.stages, count)
-        return self._covariances.step(most)
+        if self._leaving is None:
+            self._leaving = self._begin_leaving(count)
+        return self._leaving.step(most)
+
+    def _begin_leaving(self, count: int) -> Leaving:
+        return _Covariances(self, count)
 
     @property
     def leaving(self) -> int:
         """Number of stages that `smooth_back` is working on, 0 if it has not started."""
-        return 0 if self._covariances is None else self._covariances.count
+        return 0 if self._leaving is None else self._leaving.count
 
     def settle(self, count: int) -> SettledStates:
-        """Smooth the window and marginalise its first `count` stages."""
-        gone, means, back = self.stages[:count], self.compute_means()[1 : count + 1], self._covariances
-        if back is None or back.count != count:
-            back = _Covariances(self.stages, count)
-        back.step(len(self.stages))
-        self._revision, self._covariances, self._rounds = None, None, 0
-        columns = tuple(stage.message.columns for stage in gone)
-        rows, covariance, sigma = [], np.empty((len(gone), DIM, DIM)), []
-        for k, (stage, P) in enumerate(zip(gone, reversed(back.found), strict=True)):
-            rows.append(stage.message.state)
-            covariance[k] = P[:DIM, :DIM]
-            sigma.append(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)))
-        values = tuple(stage.message.values + e[DIM:] for stage, e in zip(gone, means, strict=True))
-        states = self.head.state[:0]
-        if gone:
-            moved, states, turns = np.array([e[:DIM] for e in means]), States.stack(rows), gone[-1].message.turns
-            covariance = turn_covariance(covariance, states, moved) if turns else move_covariance(covariance, moved)
-            states = add_error(states, moved, turns)
-            self.head = gone[-1].message
-            del self.stages[:count]
-            self._means = None
-            if not self.stages:
-                self.head = self.head.move(self.head.estimate)
-        return SettledStates(
-            t=np.array([stage.place.t for stage in gone]),
-            states=states,
-            covariance=covariance,
-            columns=columns,
-            values=values,
-            sigma=tuple(sigma),
-        )
+        """Smooth the window and marginalise its first `count` stages, 1 or more."""
+        started = self._leaving
+        settled = (started if started and started.count == count else self._begin_leaving(count)).settle()
+        self._revision, self._leaving, self._means, self._rounds = None, None, None, 0
+        self._relaxation = Relaxation()
+        self.head = self.stages[count - 1].message
+        del self.stages[:count]
+        self._marginalise(count)
+        return settled
+
+    def _marginalise(self, count: int) -> None:
+        if not self.stages:
+            self.head = self.head.move(self.head.estimate)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def find_first_moved(self, share: float = 1.0) -> int | None:
         """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
-        far = self._moves() > share
+        far = self._find_moves() > share
         return int(np.argmax(far)) if far.any() else None
 
-    def _moves(self) -> Array:
+    def _find_moves(self) -> Array:
         """(n,) how far the smoothed states are from their points, 1 at the limit."""
         means, limit = self.compute_means()[1:], self._limit[1]
         if not means:
@@ -298,7 +312,7 @@ class Window:
         """The first stage to be relinearised, stages that have moved almost as far included."""
         if every:
             return 0
-        moves = self._moves()
+        moves = self._find_moves()
         return int(np.argmax(moves > _ALMOST * share)) if np.any(moves > share) else None
 
     def linearise_at(self, means: Sequence[Array]) -> None:
@@ -320,9 +334,14 @@ class Window:
         if self._revision is None:
             first = self._find_first_again(share, always and not self._rounds)
             if first is None or self._rounds == _MAX_RELINEARISATIONS:
+                if first is None:
+                    self._relaxation = Relaxation()
                 self._rounds = 0
                 return False
-            self._revision, self._rounds = Revision(self, first), self._rounds + 1
+            step = np.array([e[:3] for e in self.compute_means()[1:]])
+            step[:first] = 0.0
+            self._rounds += 1
+            self._revision = Revision(self, first, share=self._relaxation.find_share(step))
         if self._revision.step(count, renewed):
             self._revision = None
         else:
