@@ -137,7 +137,18 @@ SAME_TIME = 1e-6  # s; measurements closer together than this share a keyframe
 
 
 def keep_apart(t: Array, least: float) -> Array:
-    """The first of times (N,), in order, and each that is `least` s or more after the one before; none needs later."""
+    """Times that are apart.
+
+    Parameters
+    ----------
+    t : (N,) s, in order.
+    least : s, between two of them.
+
+    Returns
+    -------
+    array
+        The first time, and each that is `least` or more after the one before; none needs later ones.
+    """
     out = [float(t[0])]
     for x in t.tolist():
         if x - out[-1] >= least:

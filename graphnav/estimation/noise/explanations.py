@@ -70,8 +70,12 @@ class _CommonError(Constraint):
         return Linearized(residual, linear.jacobians | {self.error: J}, linear.sigma)
 
 
-def add_common_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> Problem:
-    """The problem with one unknown error for each of some constraints in each span (s)."""
+def add_common_errors(
+    problem: Problem, spans: list[Span], kinds: Explanation, grows: bool = True, size: float | None = None
+) -> Problem:
+    """The problem with one unknown error for each of some constraints in each span (s), which may grow linearly, of a
+    size (1-sigma, in units of the rows) as large as faults get when None.
+    """
     begins, wide = [float(problem.t[0]) - 1.0], [0.0]
     for a, b in spans:
         begins += [a, b + 2.0 * SAME_TIME]  # a node holds from this much before it
@@ -81,7 +85,8 @@ def add_common_errors(problem: Problem, spans: list[Span], kinds: Explanation) -
         if rows.name not in kinds:
             return rows
         name, m = f"{rows.name}_fault", len(rows.axes)
-        sigma = np.maximum(np.outer(wide, np.full(2 * m, SIZES[rows.unit])), _NEGLIGIBLE_SIGMA)
+        each = SIZES[rows.unit] if size is None else size
+        sigma = np.maximum(np.outer(wide, np.repeat([each, each * grows], m)), _NEGLIGIBLE_SIGMA)
         own = Parameter(name, np.zeros(sigma.shape), sigma, rows.unit, begins=np.array(begins))
         t = problem.t[rows.keyframe]
         return _CommonError(

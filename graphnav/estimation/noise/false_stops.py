@@ -4,7 +4,9 @@ A detector calls a span stationary because nothing in it changes, and neither do
 sensor measures a speed that is certain by its stated error, the noise model tells more: with its figures, the
 likelihood of the innovations is computed with zero velocity, and with an unknown velocity instead, which is constant in
 body axes and has a prior as wide as errors of velocity get (`graphnav.estimation.faults.watch.SIZES`). Fixes in the
-span itself do not count: those of a receiver at rest may wander. A false stop is beforehand as improbable as a fault.
+span itself do not count: those of a receiver at rest may wander. Nor does a velocity of the stated sigma of the zero:
+an idling engine shakes the IMU at the same phase in every keyframe, or nearly, which in a long stop adds up to a
+distance. A false stop is beforehand as improbable as a fault.
 """
 
 from __future__ import annotations
@@ -79,10 +81,15 @@ def find_false_stops(
     )
     used = apply_noise(base, noise)
     trials = Trials(used, reuse_points(*near, used), listed)
-    stands = trials.filter(used).log_likelihood() - compute_row_costs(used, noise.tails)
-    free = add_common_errors(weigh_rows(used, {rows.name: np.ones(len(rows))}), listed, _OF_STOPS)
-    moves = trials.filter(free, _OF_STOPS).log_likelihood() - compute_row_costs(used, noise.tails, without=_OF_STOPS)
-    return spans[trials.sum_spans(moves - stands) > FAULT_COST], trials.passes
+    costs = compute_row_costs(used, noise.tails)
+    stands = trials.sum_spans(trials.filter(used).log_likelihood() - costs)
+    size = float(np.median(rows.sigma))  # type: ignore[attr-defined]
+    shaken = add_common_errors(used, listed, _OF_STOPS, grows=False, size=size)
+    stands = np.maximum(stands, trials.sum_spans(trials.filter(shaken, _OF_STOPS).log_likelihood() - costs))
+    free = add_common_errors(weigh_rows(used, {rows.name: np.ones(len(rows))}), listed, _OF_STOPS, grows=False)
+    costs = compute_row_costs(used, noise.tails, without=_OF_STOPS)
+    moves = trials.sum_spans(trials.filter(free, _OF_STOPS).log_likelihood() - costs)
+    return spans[moves - stands > FAULT_COST], trials.passes
 
 
 def leave_out_false_stops(
