@@ -136,26 +136,6 @@ class BuildContext:
 SAME_TIME = 1e-6  # s; measurements closer together than this share a keyframe
 
 
-def keep_apart(t: Array, least: float) -> Array:
-    """Times that are apart.
-
-    Parameters
-    ----------
-    t : (N,) s, in order.
-    least : s, between two of them.
-
-    Returns
-    -------
-    array
-        The first time, and each that is `least` or more after the one before; none needs later ones.
-    """
-    out = [float(t[0])]
-    for x in t.tolist():
-        if x - out[-1] >= least:
-            out.append(x)
-    return np.array(out)
-
-
 @dataclass(frozen=True)
 class TypicalSigmas:
     """Typical sigmas stated by the fixes of a running drive: the units of their time-correlated errors."""

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
-from graphnav.constraints.base import SAME_TIME, keep_apart
+from graphnav.constraints.base import SAME_TIME
 from graphnav.core.errors import ConfigError
+from graphnav.core.interpolation import keep_apart
 from graphnav.gnss.series import RawGnss, choose_primary
 from graphnav.gnss.single_point import choose_coefficients, look
 from graphnav.recording import Recording

@@ -122,6 +122,15 @@ def pick_nearest(rows: Array, t: Array) -> NDArray[np.intp]:
     return np.where(np.abs(rows[left] - t) < np.abs(rows[right] - t), left, right)
 
 
+def keep_apart(t: Array, least: float) -> Array:
+    """The first of times (N,), in order, and each that is `least` or more after the one before; none needs later."""
+    out = [float(t[0])]
+    for x in t.tolist():
+        if x - out[-1] >= least:
+            out.append(x)
+    return np.array(out)
+
+
 def differentiate(trajectory: Trajectory, max_gap: float) -> Array:
     """Velocities (K, 3) in m/s of a trajectory's positions, in its local frame or that of its first row.
 

@@ -11,10 +11,11 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints import list_kinds
-from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, keep_apart
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
 from graphnav.core.findings import describe_gaps
+from graphnav.core.interpolation import keep_apart
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, Parameter, States
