@@ -267,9 +267,9 @@ def _find_densities(recording: Recording, settings: Settings, solutions: Mapping
     if not any(group.startswith("imu.") for solution in solutions.values() for group in solution.noise.figures):
         return None
     from graphnav.estimation.noise.imu_floor import apply_measured_floor
-    from graphnav.imu.onboard_offset import remove_onboard_offset
+    from graphnav.imu.repairs import repair_imu
 
-    return apply_measured_floor(remove_onboard_offset(recording, settings)[0], settings)[0].imu.noise
+    return apply_measured_floor(repair_imu(recording, settings)[0], settings)[0].imu.noise
 
 
 def _read_others(request: Request, recording: Recording, solutions: Mapping[str, Solution]) -> dict[str, Solution]:

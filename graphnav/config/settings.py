@@ -60,6 +60,9 @@ class ImuSettings(Section):
     onboard_offset: bool = Field(
         True, description="of a foot: undo the unit's own gyro offset correction where the rests show one"
     )
+    regular_stamps: bool = Field(
+        True, description="use the times of a regular clock where the signals show that stamps scatter about one"
+    )
 
 
 class NoiseSettings(Section):

@@ -50,7 +50,7 @@ from graphnav.estimation.stamps import (
     shift_to_imu_clock,
     shift_to_own_clocks,
 )
-from graphnav.imu.onboard_offset import remove_onboard_offset
+from graphnav.imu.repairs import repair_imu
 from graphnav.recording import Own, Recording
 from graphnav.recording.checks.aiding import describe_gnss_apart
 from graphnav.recording.checks.clock import ClockOffsets
@@ -236,7 +236,7 @@ def _solve(
     noise: NoiseModel | None,
 ) -> dict[str, Solution]:
     began = time.perf_counter()
-    recording, undone = remove_onboard_offset(recording, settings)
+    recording, undone = repair_imu(recording, settings)
     recording, shown = apply_measured_floor(recording, settings)
     detection = time.perf_counter() - began
 
