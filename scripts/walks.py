@@ -14,6 +14,10 @@ usual kind reached on the same recordings, in stance (`plain_filter.py`).
 
 Instead: so many times without six pieces of the IMU's log, of 15 to 300 ms, as a radio loses them; rms of the errors
 and means of the NEES over the times.
+
+    python scripts/walks.py --scatter 0.003
+
+Instead: with stamps of the IMU that scatter by so many seconds, in order.
 """
 
 from __future__ import annotations
@@ -21,8 +25,9 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -59,10 +64,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", default=",".join(SETS), help="folders, comma separated (%(default)s)")
     parser.add_argument("--gaps", type=int, default=0, help="times without pieces of the log (%(default)s)")
+    parser.add_argument("--scatter", type=float, default=0.0, help="s, 1-sigma of the stamps (%(default)s)")
     options = parser.parse_args()
     folder = Path(os.environ["GRAPHNAV_DATA"])
-    if options.gaps:
-        list_gaps(folder, options.sets.split(","), options.gaps)
+    if options.gaps or options.scatter:
+        damage = lose_pieces if options.gaps else partial(scatter_stamps, options.scatter)
+        list_damaged(folder, options.sets.split(","), damage, options.gaps or 1)
         return
     print("| walk | s | plain filter | " + " | ".join(f"{s}, {c} lateral" for c in CASES for s in SOLVERS), end="")
     print(" | batch, in stance | batch, stances once | batch, point fitted | batch, bias before", end="")
@@ -77,7 +84,9 @@ def main() -> None:
         print(f"| **{name}, median** | | {' | '.join(median)} |" + " |" * 5)
 
 
-def list_gaps(folder: Path, sets: list[str], draws: int) -> None:
+def list_damaged(
+    folder: Path, sets: list[str], damage: Callable[[Recording, np.random.Generator], Recording], draws: int
+) -> None:
     columns = [f"{what}, {solver}" for what in ("m", "NEES hor.") for solver in SOLVERS]
     print(f"| walk | {' | '.join(columns)} |\n|{' --- |' * (1 + len(columns))}")
     for name in sets:
@@ -85,19 +94,18 @@ def list_gaps(folder: Path, sets: list[str], draws: int) -> None:
         for path in sorted((folder / name).glob("*.toml")):
             recording, errors = load(path), []
             for draw in range(draws):
-                lost = lose_pieces(recording, np.random.default_rng(draw))
-                solutions = run(lost)
+                solutions = run(damage(recording, np.random.default_rng(draw)))
                 stated = SETS[name]
                 sigma = estimate_floor_sigma(recording, solutions["batch"]) if stated is None else stated
                 found = [compute_walk_errors(recording, solutions[solver], sigma) for solver in SOLVERS]
                 errors.append([*(one.horizontal for one in found), *(one.nees_h for one in found)])
             off, nees = np.hsplit(np.array(errors), 2)
             rows.append([*np.sqrt((off**2).mean(axis=0)), *nees.mean(axis=0)])
-            print(f"| {recording.name} | {format_gaps(rows[-1])} |", flush=True)
-        print(f"| **{name}, median** | {format_gaps(np.median(rows, axis=0))} |", flush=True)
+            print(f"| {recording.name} | {format_row(rows[-1])} |", flush=True)
+        print(f"| **{name}, median** | {format_row(np.median(rows, axis=0))} |", flush=True)
 
 
-def format_gaps(row: Iterable[float]) -> str:
+def format_row(row: Iterable[float]) -> str:
     return " | ".join(f"{x:.{3 if k < len(SOLVERS) else 2}f}" for k, x in enumerate(row))
 
 
@@ -109,6 +117,12 @@ def lose_pieces(recording: Recording, rng: np.random.Generator) -> Recording:
         begin = t[rng.integers(len(t) // 4, len(t) - 200)]
         keep &= (t <= begin) | (t > begin + rng.uniform(0.015, 0.3))
     return replace(recording, imu=take_rows(recording.imu, keep))
+
+
+def scatter_stamps(scatter: float, recording: Recording, rng: np.random.Generator) -> Recording:
+    """The recording with IMU stamps that scatter by so much (s), in order."""
+    t = np.sort(recording.imu.t + scatter * rng.standard_normal(len(recording.imu.t)))
+    return replace(recording, imu=replace(recording.imu, t=t + 1e-9 * np.arange(len(t))))
 
 
 def shown(x: float, digits: int = 3) -> str:
