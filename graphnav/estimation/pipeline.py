@@ -22,7 +22,7 @@ from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.memory import return_memory
 from graphnav.core.notes import Note, Notes
 from graphnav.core.progress import Progress, send_progress, tell
-from graphnav.core.state import BLOCKS
+from graphnav.core.state import BLOCKS, DIM
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation.building import start_sigma
@@ -43,6 +43,7 @@ from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import rts, smooth_backward
+from graphnav.estimation.solvers.turning import add_curvature
 from graphnav.estimation.stamps import (
     describe_stamps,
     find_stamps,
@@ -289,7 +290,7 @@ def _solve(
     place = BLOCKS["p"]
     apart = compute_separation(
         frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
-        smoothed.states.p, smoothed.P[:, place, place],
+        smoothed.states.p, add_curvature(smoothed.P[:, :DIM, :DIM], smoothed.states)[:, place, place],
     )  # fmt: skip
     # a graph needs the memory itself
     forward, smoothed = forward.drop_covariances(), smoothed.drop_covariances()

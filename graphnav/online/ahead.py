@@ -16,6 +16,7 @@ from graphnav.estimation.dense import Dense
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solution import make_trajectory
 from graphnav.estimation.solvers.stages import Message
+from graphnav.estimation.solvers.turning import add_curvature
 from graphnav.estimation.solvers.window import SettledStates
 from graphnav.imu.dynamics import SCALE, ImuFactors, convert_to_biases
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
@@ -53,7 +54,7 @@ def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors, noise: 
             F[:, newest.columns[SCALE]] = by_both[0, :, DIM:]
         P = F @ P @ F.T + motion.compute_noise(one, state.R_nb)[0]
         state = ahead
-    return Live(float(max(now, T)), state, P[:DIM, :DIM], T)
+    return Live(float(max(now, T)), state, add_curvature(P[None, :DIM, :DIM], state)[0], T)
 
 
 def predict_since(
@@ -74,7 +75,8 @@ def predict_since(
         mean = imu.accel[rows].mean(axis=0, keepdims=True) - ba, imu.gyro[rows].mean(axis=0, keepdims=True) - bg
         of_accel, of_gyro = convert_to_biases(scale, *mean)
         ba, bg = ba + of_accel, bg + of_gyro
-    ends, both = np.array([T, now.t]), np.stack([newest.covariance[:DIM, :DIM], now.covariance])
+    before = add_curvature(newest.covariance[None, :DIM, :DIM], start)[0]
+    ends, both = np.array([T, now.t]), np.stack([before, now.covariance])
     states = States.stack([start, now.state])
     between = Dense(ends, states, both, bridge_gaps(imu), frame, ba, bg, False, np.zeros((2, len(ba))))
     return t, *between(t)
@@ -88,7 +90,8 @@ def export(settled: SettledStates, rows: NDArray[np.bool_], frame: LocalFrame) -
     FloatingPointError
         If a state is no number.
     """
-    track = make_trajectory("online", frame, settled.t[rows], settled.states[rows], settled.covariance[rows])
+    states = settled.states[rows]
+    track = make_trajectory("online", frame, settled.t[rows], states, add_curvature(settled.covariance[rows], states))
     known = (track.llh, track.v, track.rph, track.sd_p, track.sd_v, track.sd_rph)
     if not all(x is None or np.isfinite(x).all() for x in known):
         raise FloatingPointError("states that are not finite")

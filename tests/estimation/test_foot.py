@@ -557,6 +557,17 @@ def test_real_walks(shared_data: Path) -> None:
         assert np.exp(np.mean(np.log(of_walks))) < 0.5, solver
 
 
+def test_walks_that_begin_in_stride_are_within_their_sigma(shared_data: Path) -> None:
+    """Without a rest headings are open by 12 to 28 deg: positions err on circles, and not on tangents."""
+    nees = []
+    for path in sorted((shared_data / "gcp_walks").glob("*.toml")):
+        whole = read(path)
+        walk = whole.crop(10.0, whole.duration)
+        nees.append(compute_walk_errors(walk, run(walk, solvers=("rts",))["rts"], 0.03).nees_h)
+    assert 0.3 < np.median(nees) < 2.0
+    assert max(nees) < 5.0
+
+
 def test_missing_rows_do_not_make_two_stances_of_one() -> None:
     """Standing in many pieces, between lost packets, is one deep lull and no reason to leave out the walk's."""
     walk = made("normal")

@@ -16,7 +16,13 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, linearise
 from graphnav.estimation.solvers.stages import Message
-from graphnav.estimation.solvers.turning import add_turning, change_of_point, split_turn, turn_covariance
+from graphnav.estimation.solvers.turning import (
+    add_curvature,
+    add_turning,
+    change_of_point,
+    split_turn,
+    turn_covariance,
+)
 from graphnav.estimation.solvers.window import Window
 from graphnav.online import Online, drop_rows, list_rows
 from graphnav.simulation import simulate
@@ -55,6 +61,23 @@ def test_what_is_beside_a_turn_turns_with_it(moves: tuple[States, Array]) -> Non
     states, e = moves
     both = turned(add_turning(states, e), 0.7)
     np.testing.assert_allclose(add_turning(states, e + 0.7 * along(states)).minus(both), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.3, 0.5])
+def test_unknown_headings_move_positions_on_circles(moves: tuple[States, Array], sigma: float) -> None:
+    """The mean square about the point, along the way to the origin and across, is that of turns drawn at random."""
+    states, _ = moves
+    x = along(states)
+    P = sigma**2 * x[:, :, None] * x[:, None, :] + 1e-4 * np.eye(DIM)
+    psi = sigma * np.random.default_rng(1).standard_normal(100_000)
+    away = np.hypot(states.p[:, 0], states.p[:, 1])
+    inward = -states.p[:, :2] / away[:, None]
+    found = add_curvature(P, states)
+    np.testing.assert_array_equal(found[:, [2, 9], [2, 9]], P[:, [2, 9], [2, 9]])
+    square = np.einsum("ki,kij,kj->k", inward, found[:, 3:5, 3:5], inward) - 1e-4
+    np.testing.assert_allclose(square, away**2 * np.mean((1.0 - np.cos(psi)) ** 2), rtol=0.5 * sigma + 0.03)
+    first = np.einsum("ki,kij,kj->k", inward, P[:, 3:5, 3:5], inward) - 1e-4
+    assert np.all(first < 1e-9 * away**2)
 
 
 def test_near_the_point_it_is_the_usual_error_state(moves: tuple[States, Array]) -> None:

@@ -24,7 +24,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array, mv
-from graphnav.core.state import DIM, MOVING, States
+from graphnav.core.state import BLOCKS, DIM, MOVING, States
 from graphnav.estimation.solvers.invariant import turn
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -96,3 +96,18 @@ def change_of_point(states: States, e: Array) -> Array:
 def turn_covariance(P: Array, states: States, e: Array) -> Array:
     """Covariances (K, 15, 15) of errors about points turned into those about the points moved by e (K, 15)."""
     return np.asarray(turn(P.copy(), np.linalg.inv(change_of_point(states, e))))
+
+
+def add_curvature(P: Array, states: States) -> Array:
+    """Covariances (K, 15, 15) of K states with what an unknown heading makes of positions to second order.
+
+    What a heading that is off by psi turns moves on a circle, and not on its tangent: inward by psi/2 times as far. To
+    first order the part of a position that psi moves is off by psi c / var(psi), with c the covariance of both, so
+    inward of that the mean square is (3/4) m m^T, of m = c turned by a quarter (E psi^4 = 3 var(psi)^2). Where fixes
+    bound the position c is nearly zero; of a walk whose heading is lost by 30 deg this is a fifth of its length.
+    """
+    theta, p = BLOCKS["theta"], BLOCKS["p"]
+    m = np.einsum("kij,kj->ki", P[:, p, theta], states.R_nb[:, 2]) @ _Z.T
+    out = P.copy()
+    out[:, p, p] += 0.75 * m[:, :, None] * m[:, None, :]
+    return out
