@@ -44,8 +44,7 @@ from graphnav.estimation.solvers.passes import (
 )
 from graphnav.estimation.solvers.recursion import STRETCH, move_columns, smooth_filtered
 
-# largest ratio of filtered to smoothed sigma: P - P N P has a relative error of eps times its square, a millionth
-_CANCELLED = 7e4
+_EXACT = 1e-6  # relative error that a smoothed variance may have by rounding
 
 
 def smooth_backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
@@ -80,9 +79,9 @@ def _smooth(forward: ForwardRecord, P: Array, t: Array | None = None, progress: 
         if len(P):
             N = solved @ (ahead - P[end]) @ solved
     if forward.updates is not None:
-        errors = _smooth_given(forward, forward.updates, end, r, N, P, progress=progress)[0]
+        errors, _, _, N_diagonal, *_ = _smooth_given(forward, forward.updates, end, r, N, P, progress=progress)
         if len(P):
-            _restore_digits(forward, P, end)
+            _restore_digits(forward, P, N_diagonal)
         parts = [move_points(about.take_first(end), errors), *parts]
     return join_passes(parts)
 
@@ -165,13 +164,19 @@ def _smooth_given(
     return *found, variance, of_rows
 
 
-def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:
-    """Recompute covariances where P - P N P lost its digits, as before a first fix, by stable steps.
+def _restore_digits(forward: ForwardRecord, P: Array, N_diagonal: Array) -> None:
+    """Recompute covariances where P - P N P lost its digits, by stable steps.
 
-    With C and P^s of the next keyframe, in Joseph's form: (I - C F) P_k (I - C F)^T + C (P^s + Q) C^T.
+    Rounded to eps, N of keyframe s changes P of keyframe k <= s by at most eps P_k,ii sum_j (P^-_s,jj N_s,jj), as its
+    covariance with P^-_s is bounded by both. The sum is large where rows determine a difference of columns and nothing
+    determines the columns, as at a stop without GNSS, and before a first fix. With C and P^s of the next keyframe, in
+    Joseph's form: (I - C F) P_k (I - C F)^T + C (P^s + Q) C^T.
     """
-    after, before = (np.diagonal(x[:end], axis1=1, axis2=2) for x in (P, forward.P))
-    lost = np.flatnonzero(np.any(after * _CANCELLED < before, axis=1))
+    end = len(N_diagonal)
+    after, before, predicted = (np.diagonal(x[:end], axis1=1, axis2=2) for x in (P, forward.P, forward.P_predicted))
+    rounded = np.finfo(float).eps * np.sum(predicted * N_diagonal, axis=1)
+    worst = np.maximum.accumulate(rounded[::-1])[::-1]  # of all keyframes from each on
+    lost = np.flatnonzero(np.any(worst[:, None] * before > _EXACT * after, axis=1))
     I = np.eye(P.shape[1])
     for k in lost[lost < len(P) - 1][::-1]:
         F, Pp = move_columns(forward.F[k], forward.decay[k], I), forward.P_predicted[k + 1]
