@@ -17,7 +17,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.foot import Stance
 from graphnav.constraints.odometer import average_speed
-from graphnav.core.beside import begin_beside
+from graphnav.core.beside import Beside, Later, begin_beside, may_begin
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
@@ -37,7 +37,7 @@ from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.chords import find_filled_gaps
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
-from graphnav.estimation.noise.tails import widen_unweighted
+from graphnav.estimation.noise.tails import widen_by_tails, widen_unweighted
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_in_gaps, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.noise_search import Weigh, begin_noise, find_noise
@@ -54,6 +54,8 @@ from graphnav.estimation.solvers.passes import (
 )
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording
+
+_Passes = tuple[FilterPass, SmootherPass, dict[str, float]]  # and the seconds that they took, by stage
 
 
 @dataclass(frozen=True)
@@ -211,6 +213,7 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
     recording, builder, built, noise = begun.recording, begun.builder, begun.built, begun.noise
     settings, clock, passes, evidence = builder.settings, builder.clock, Counter(begun.passes), np.inf
     near: tuple[Points, Problem] | None = None
+    foreseen = _foresee(begun)
     if begun.found is not None:
         tell("noise")
         with clock.count_time("noise"):
@@ -225,7 +228,13 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
     try:
-        forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
+        if foreseen is not None and foreseen.is_of(built.problem, noise):
+            problem = foreseen.problem
+            forward, smoothed, seconds = foreseen.passes.get_result()
+            clock.add(seconds)
+        else:
+            foreseen = None  # which ends it
+            forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge
         (initial, *_), more = find_initial_points(problem, aligned.until)
         passes.update(filter=more, smoother=more)
@@ -268,6 +277,41 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
         evidence, ahead, begun.unmeasured,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Foreseen:
+    """The filter of a drive, begun beside the search for what is wrong in it: that of a noise model that stands where
+    nothing is.
+    """
+
+    built: Problem
+    noise: NoiseModel
+    problem: Problem  # the same with this noise model
+    passes: Beside[_Passes] | Later[_Passes]
+
+    def is_of(self, built: Problem, noise: NoiseModel) -> bool:
+        """Whether this noise model is the one that was found."""
+        one = self.noise
+        same = built is self.built and noise.weights is one.weights and noise.times is one.times
+        return same and noise.figures == one.figures and not noise.excluded
+
+
+def _foresee(begun: Begun) -> _Foreseen | None:
+    """Begin the filter with the noise model of all measurements, where another is not likely already."""
+    found = begun.found
+    if found is None or found.freed or found.rival is not None or not may_begin():
+        return None
+    noise = widen_by_tails(found.base, found.noise)
+    problem = drop_parts(apply_noise(found.base, noise))
+    return _Foreseen(
+        found.base, noise, problem, begin_beside(partial(_count_filter, problem, begun.built.aligned.until))
+    )
+
+
+def _count_filter(problem: Problem, opening: float | None) -> _Passes:
+    clock = Clock()
+    return *_filter_and_smooth(problem, opening, None, clock, None), clock.seconds
 
 
 def _describe_missing(problem: Problem) -> tuple[str, ...]:
