@@ -66,6 +66,9 @@ class Later(Generic[T]):
         """The result."""
         return self._result
 
+    def end(self) -> None:
+        """Nothing was begun."""
+
 
 class Beside(Generic[T]):
     """Work that a second process has begun; it ends with this object, or with this process."""
@@ -91,9 +94,9 @@ class Beside(Generic[T]):
     def get_result(self) -> T:
         """Wait for the result; what the work raised is raised here.
 
-        If the process was killed, the work is done in this one.
+        If the process was ended or killed, the work is done in this one.
         """
-        if self._stop.alive:
+        if not hasattr(self, "_found"):
             try:
                 with os.fdopen(self._end, "rb", closefd=False) as pipe:
                     self._found = _Receiver(self._given, pipe).load()  # of a process of our own
@@ -105,6 +108,10 @@ class Beside(Generic[T]):
         if error is not None:
             raise error
         return result
+
+    def end(self) -> None:
+        """End the process: its result is not wanted any more."""
+        self._stop()
 
 
 def _list_given(work: Callable[[], object]) -> list[object]:

@@ -120,3 +120,10 @@ def test_what_the_work_was_given_is_not_sent_back() -> None:
     assert process != os.getpid()
     assert [id(one) for one in found[:3]] == [id(one) for one in (numbers, names["inner"], names["inner"][0])]
     np.testing.assert_array_equal(found[3], numbers[:5])
+
+
+def test_what_was_ended_is_done_here_if_it_is_wanted_after_all() -> None:
+    allow_second_process()
+    work = begin_beside(os.getpid)
+    work.end()
+    assert work.get_result() == os.getpid()
