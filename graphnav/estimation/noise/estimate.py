@@ -302,7 +302,8 @@ def _improve_time(figures: Components, chain: ParameterChain, observed: Array, l
     assert p.correlation_time is not None
     if not len(dt):
         return
-    (dt, left), first = np.unique([dt, left], axis=1, return_inverse=True)  # few differ
+    pairs, first = np.unique(dt + 1j * left, return_inverse=True)  # few differ; by axis it takes fifteen times as long
+    dt, left = pairs.real, pairs.imag
     later, cross, before, count = (
         np.stack([np.bincount(first, one, len(dt)) for one in some.T[observed]], axis=-1)
         for some in (later, cross, before, np.ones_like(before))
