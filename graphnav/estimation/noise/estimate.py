@@ -186,7 +186,7 @@ def _iterate(
     evidence, passes = now - _compute_weight_cost(used, figures), round(done / total)
     figures.sigmas = _compute_sigmas(figures, used, *latest)
     return NoiseEstimate(
-        figures.build_model(), latest[1], prior_then, evidence, Counter(filter=passes, smoother=passes)
+        figures.build_model(), latest[1].drop_rows(), prior_then, evidence, Counter(filter=passes, smoother=passes)
     )
 
 
@@ -213,8 +213,6 @@ def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, Momen
 def _splice(about: Points, part: Points) -> Points:
     """Points with the first ones replaced."""
     n = len(part.values)
-    if n == len(about.values):
-        return part
     states = type(part.states).stack([part.states, about.states[n:]])
     return Points(states, np.concatenate([part.values, about.values[n:]]))
 
