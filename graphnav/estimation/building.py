@@ -5,7 +5,7 @@ stops.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -43,6 +43,11 @@ class Clock:
 
     seconds: dict[str, float] = field(default_factory=dict)
 
+    def add(self, seconds: Mapping[str, float]) -> None:
+        """Add the time of stages that was counted elsewhere."""
+        for stage, more in seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + more
+
     @contextmanager
     def count_time(self, stage: str) -> Iterator[None]:
         """Count the time within this context for a stage."""
@@ -50,7 +55,7 @@ class Clock:
         try:
             yield
         finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
+            self.add({stage: time.perf_counter() - began})
 
 
 @dataclass(frozen=True)

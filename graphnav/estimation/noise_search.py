@@ -49,18 +49,13 @@ _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong ra
 
 
 def begin_noise(
-    builder: ProblemBuilder,
-    built: BuiltProblem,
-    progress: Progress | None,
-    passes: Counter[str],
-    start: NoiseModel | None = None,
-) -> tuple[Array, Estimated]:
-    """The false stops (n, 2), s, by all other measurements, and the noise model of these, with nothing else left out.
+    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, start: NoiseModel | None = None
+) -> Estimated:
+    """The problem and its noise model of all measurements.
 
     Parameters
     ----------
     built : without the false stops of the builder.
-    passes : to which those made for stops are added; the others are with the estimate.
     start : initial figures, of nearly the same measurements.
 
     Raises
@@ -68,12 +63,24 @@ def begin_noise(
     EstimationError
         If the filter breaks down.
     """
+    return built, begin_jointly(built.problem, builder.settings.gnss, built.aligned.until, progress, start)
+
+
+def leave_out_contradicted_stops(
+    builder: ProblemBuilder, begun: Estimated, progress: Progress | None, passes: Counter[str]
+) -> tuple[Array, Estimated]:
+    """The false stops (n, 2), s, by all other measurements, and the noise model of these, with nothing else left out.
+
+    Parameters
+    ----------
+    begun : of `begin_noise`.
+    passes : to which those made for stops are added; the others are with the estimate.
+    """
 
     def begin_without(before: Estimated, false: Array) -> Estimated:
         moving = replace(builder, false_stops=false)
-        return _count(_begin(moving, moving.build_moving(before[0]), progress), before)
+        return _count(begin_noise(moving, moving.build_moving(before[0]), progress), before)
 
-    begun = _begin(builder, built, progress, start)
     one, false = leave_out_false_stops(begun, partial(_judge, passes), begin_without, builder.false_stops)
     return false, one
 
@@ -92,7 +99,7 @@ def find_noise(
 
     Parameters
     ----------
-    builder, begun : with the false stops of `begin_noise`, and what it found.
+    builder, begun : with the false stops of `leave_out_contradicted_stops`, and what it found.
     passes : to which those made are added.
     """
 
@@ -103,14 +110,14 @@ def find_noise(
         if np.array_equal(false, builder.false_stops):
             return _count(found, before)
         moving = replace(builder, false_stops=false)
-        return _count(_find(moving, _begin(moving, moving.build_moving(before[0]), progress), progress), before)
+        return _count(_find(moving, begin_noise(moving, moving.build_moving(before[0]), progress), progress), before)
 
     one = found = _find(builder, begun, progress)
     false = builder.false_stops
     if len(false) and found[1].noise.excluded:
         with contextlib.suppress(*BREAKDOWN):
             every = replace(builder, false_stops=NONE)
-            one = _count(_find(every, _begin(every, every.build_every(found[0]), progress), progress), found)
+            one = _count(_find(every, begin_noise(every, every.build_every(found[0]), progress), progress), found)
             false = NONE
     (built, joint), false = leave_out_false_stops(one, judge, find_without, false)
     best, built = joint.estimate, replace(built, problem=joint.base)
@@ -141,13 +148,6 @@ def _judge(passes: Counter[str], one: Estimated) -> Array:
 def _count(one: Estimated, before: Estimated) -> Estimated:
     """The estimate with the passes of one before it as well."""
     return one[0], one[1].count(before[1].estimate.passes + one[1].estimate.passes)
-
-
-def _begin(
-    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, start: NoiseModel | None = None
-) -> Estimated:
-    """The problem and its noise model of all measurements."""
-    return built, begin_jointly(built.problem, builder.settings.gnss, built.aligned.until, progress, start)
 
 
 def _find(builder: ProblemBuilder, begun: Estimated, progress: Progress | None) -> Estimated:

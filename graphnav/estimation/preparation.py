@@ -17,7 +17,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.foot import Stance
 from graphnav.constraints.odometer import average_speed
-from graphnav.core.beside import begin_beside
+from graphnav.core.beside import Beside, Later, begin_beside, may_begin
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
@@ -37,10 +37,10 @@ from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.chords import find_filled_gaps
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
-from graphnav.estimation.noise.tails import widen_unweighted
+from graphnav.estimation.noise.tails import widen_by_tails, widen_unweighted
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_in_gaps, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
-from graphnav.estimation.noise_search import Weigh, begin_noise, find_noise
+from graphnav.estimation.noise_search import Weigh, begin_noise, find_noise, leave_out_contradicted_stops
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.relinearisation import is_clearly_worse, linearise_known, linearise_searched, relinearise
@@ -54,6 +54,8 @@ from graphnav.estimation.solvers.passes import (
 )
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording
+
+_Passes = tuple[FilterPass, SmootherPass, dict[str, float]]  # and the seconds that they took, by stage
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,24 @@ class Prepared:
 
 
 @dataclass(frozen=True)
+class Foreseen:
+    """The filter of a drive, begun beside the search for what is wrong in it: that of the noise model that stands
+    where nothing is.
+    """
+
+    built: Problem
+    noise: NoiseModel
+    problem: Problem  # the same with this noise model
+    passes: Beside[_Passes] | Later[_Passes]
+
+    def is_of(self, built: Problem, noise: NoiseModel) -> bool:
+        """Whether this noise model is the one that was found."""
+        one = self.noise
+        same = built is self.built and noise.weights is one.weights and noise.times is one.times
+        return same and noise.figures == one.figures and not noise.excluded
+
+
+@dataclass(frozen=True)
 class Begun:
     """A recording aligned, its problem built, and a noise model of all measurements, before any is left out."""
 
@@ -99,6 +119,7 @@ class Begun:
     spacing: float  # s, between fixes
     larger: bool  # whether bias walks are to be estimated
     passes: Counter[str]
+    foreseen: Foreseen | None = None
 
     @property
     def log_evidence(self) -> float:
@@ -189,11 +210,13 @@ def begin_preparation(
         return Begun(recording, unmeasured, builder, built, noise, None, spacing, larger, passes)
     tell("noise")
     with clock.count_time("noise"):
-        false_stops, (built, found) = begin_noise(
-            builder, built, progress, passes, None if before is None else before.figures
-        )
+        one = begin_noise(builder, built, progress, None if before is None else before.figures)
+        if before is not None and before.foreseen is not None:
+            before.foreseen.passes.end()  # for what takes its place
+        foreseen = _foresee(*one)
+        false_stops, (built, found) = leave_out_contradicted_stops(builder, one, progress, passes)
     builder = replace(builder, false_stops=false_stops)
-    return Begun(recording, unmeasured, builder, built, None, found, spacing, larger, passes)
+    return Begun(recording, unmeasured, builder, built, None, found, spacing, larger, passes, foreseen)
 
 
 def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None = None) -> Prepared:
@@ -225,7 +248,14 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
     try:
-        forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
+        if (foreseen := begun.foreseen) is not None and foreseen.is_of(built.problem, noise):
+            problem = foreseen.problem
+            forward, smoothed, seconds = foreseen.passes.get_result()
+            clock.add(seconds)
+        else:
+            if foreseen is not None:
+                foreseen.passes.end()
+            forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge
         (initial, *_), more = find_initial_points(problem, aligned.until)
         passes.update(filter=more, smoother=more)
@@ -268,6 +298,20 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
         evidence, ahead, begun.unmeasured,
     )  # fmt: skip
+
+
+def _foresee(built: BuiltProblem, found: JointEstimate) -> Foreseen | None:
+    """Begin the filter with the noise model of all measurements, where another is not likely already."""
+    if found.freed or found.rival is not None or not may_begin():
+        return None
+    noise = widen_by_tails(found.base, found.noise)
+    problem = drop_parts(apply_noise(found.base, noise))
+    return Foreseen(found.base, noise, problem, begin_beside(partial(_count_filter, problem, built.aligned.until)))
+
+
+def _count_filter(problem: Problem, opening: float | None) -> _Passes:
+    clock = Clock()
+    return *_filter_and_smooth(problem, opening, None, clock, None), clock.seconds
 
 
 def _describe_missing(problem: Problem) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -106,3 +107,23 @@ def test_it_ends_with_what_it_was_begun_for() -> None:
     work = begin_beside(lambda: time.sleep(1000.0))
     assert isinstance(work, Beside)
     del work  # the fixture sees that nothing is left
+
+
+def test_what_the_work_was_given_is_not_sent_back() -> None:
+    allow_second_process()
+    numbers, names = np.arange(10.0), {"inner": [np.ones(3)]}
+
+    def give_back(numbers: np.ndarray, names: dict[str, list[np.ndarray]]) -> tuple[object, ...]:
+        return os.getpid(), numbers, names["inner"], names["inner"][0], numbers[:5]
+
+    process, *found = begin_beside(partial(give_back, numbers, names=names)).get_result()
+    assert process != os.getpid()
+    assert [id(one) for one in found[:3]] == [id(one) for one in (numbers, names["inner"], names["inner"][0])]
+    np.testing.assert_array_equal(found[3], numbers[:5])
+
+
+def test_what_was_ended_is_done_here_if_it_is_wanted_after_all() -> None:
+    allow_second_process()
+    work = begin_beside(os.getpid)
+    work.end()
+    assert work.get_result() == os.getpid()

@@ -186,7 +186,7 @@ def _iterate(
     evidence, passes = now - _compute_weight_cost(used, figures), round(done / total)
     figures.sigmas = _compute_sigmas(figures, used, *latest)
     return NoiseEstimate(
-        figures.build_model(), latest[1], prior_then, evidence, Counter(filter=passes, smoother=passes)
+        figures.build_model(), latest[1].drop_rows(), prior_then, evidence, Counter(filter=passes, smoother=passes)
     )
 
 
@@ -213,8 +213,6 @@ def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, Momen
 def _splice(about: Points, part: Points) -> Points:
     """Points with the first ones replaced."""
     n = len(part.values)
-    if n == len(about.values):
-        return part
     states = type(part.states).stack([part.states, about.states[n:]])
     return Points(states, np.concatenate([part.values, about.values[n:]]))
 
@@ -302,7 +300,8 @@ def _improve_time(figures: Components, chain: ParameterChain, observed: Array, l
     assert p.correlation_time is not None
     if not len(dt):
         return
-    (dt, left), first = np.unique([dt, left], axis=1, return_inverse=True)  # few differ
+    pairs, first = np.unique(dt + 1j * left, return_inverse=True)  # few differ; by axis it takes fifteen times as long
+    dt, left = pairs.real, pairs.imag
     later, cross, before, count = (
         np.stack([np.bincount(first, one, len(dt)) for one in some.T[observed]], axis=-1)
         for some in (later, cross, before, np.ones_like(before))

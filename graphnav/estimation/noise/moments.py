@@ -30,7 +30,7 @@ from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import Rows, find_stepping, linearise, shift
+from graphnav.estimation.solvers.linearise import Rows, find_stepping, shift
 from graphnav.estimation.solvers.passes import MomentPass, SmootherPass
 
 _FORGOTTEN = 1e-6  # relative remainder of a difference below which it is rounding error
@@ -113,7 +113,7 @@ def collect_process_moments(
 
 def predict_errors(problem: Problem, rows: Constraint, smoothed: MomentPass) -> tuple[Array, Array]:
     """Errors (N, m) of the rows of a constraint, each number predicted by a smoother without it, and sigmas (N, m)."""
-    linear = linearise(rows, smoothed, problem.columns)
+    linear = smoothed.linearise(rows, problem.columns, len(rows))
     return linear.residual / _compute_redundancies(linear, smoothed.cover_rows(linear, len(rows)))[1], linear.stated
 
 
@@ -126,7 +126,7 @@ def _compute_redundancies(linear: Rows, HPH: Array) -> tuple[Array, Array]:
 
 def collect_row_moments(problem: Problem, rows: Constraint, smoothed: MomentPass | SmootherPass, n: int) -> RowMoments:
     """Of the first n rows of a constraint."""
-    linear = linearise(rows, smoothed, problem.columns, slice(0, n))
+    linear = smoothed.linearise(rows, problem.columns, n)
     HPH = smoothed.cover_rows(linear, n)
     R = linear.stated**2
     w, B = _compute_redundancies(linear, HPH)

@@ -15,7 +15,7 @@ from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem, SolvedProblem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
-from graphnav.estimation.solvers.linearise import Points, Rows, find_last_keyframes, linearise, scale_at, shift
+from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, scale_at, shift
 from graphnav.estimation.solvers.recursion import Arrays, RowBlocks
 from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.stack import Innovations
@@ -41,6 +41,10 @@ class SmootherPass(Points):
         """The same without covariances, which are nearly all of its memory."""
         return replace(self, P=self.P[:0].copy())
 
+    def linearise(self, rows: Constraint, columns: Columns, n: int) -> Rows:
+        """The first n rows of a constraint, linearised at the smoothed points."""
+        return linearise(rows, self, columns, slice(0, n))
+
     def cover_rows(self, linear: Rows, n: int) -> Array:
         """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised at the smoothed points."""
         return linear.H @ self.P[linear.constraint.keyframe[:n]] @ np.swapaxes(linear.H, 1, 2)
@@ -59,6 +63,18 @@ class MomentPass(Points):
     variance: Array  # (n, D) of the errors, of parameters with a correlation time
     of_rows: Array  # (n, M, M) H P^s H^T, where each of these stands
     places: dict[str, tuple[Array, Array]]
+    linear: dict[str, Rows]  # at these points, as long as they are kept
+
+    def drop_rows(self) -> MomentPass:
+        """The same without the linearised rows, which are most of its memory."""
+        return replace(self, linear={})
+
+    def linearise(self, rows: Constraint, columns: Columns, n: int) -> Rows:
+        """As of `SmootherPass`."""
+        kept = self.linear.get(rows.name)
+        if kept is not None and kept.constraint is rows and len(kept.residual) == n:
+            return kept
+        return linearise(rows, self, columns, slice(0, n))
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
         """As of `SmootherPass`."""

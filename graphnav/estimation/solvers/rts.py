@@ -91,11 +91,12 @@ def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
     K, D = forward.P.shape[:2]
     assert forward.updates is not None
     one, smoothed = forward.updates, smooth_points(forward)
-    asked = np.zeros_like(one.H)
+    asked, linear = np.zeros_like(one.H), {}
     for rows in problem.constraints:
         if rows.list_noise_groups()[0]:
             which = slice(0, int(np.searchsorted(rows.keyframe, K)))
-            asked[one.places[rows.name]] = linearise(rows, smoothed, problem.columns, which).H
+            linear[rows.name] = linearise(rows, smoothed, problem.columns, which)
+            asked[one.places[rows.name]] = linear[rows.name].H
     wanted = np.zeros((K, D), dtype=bool)  # at both ends of their steps
     for chain in problem.chains:
         if chain.parameter.correlation_time is not None:
@@ -103,7 +104,7 @@ def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
             wanted[k, own] = wanted[k - 1, own] = True
     none = np.zeros(D), np.zeros((D, D)), np.empty((0, D, D))
     _, r, N, N_diagonal, variance, of_rows = _smooth_given(forward, one, K, *none, wanted, asked)
-    return MomentPass(smoothed.states, smoothed.values, r, N, N_diagonal, variance, of_rows, one.places)
+    return MomentPass(smoothed.states, smoothed.values, r, N, N_diagonal, variance, of_rows, one.places, linear)
 
 
 def _smooth_filtered(
