@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graphnav import load, run
 from graphnav.core import beside
 from graphnav.core.beside import Beside, Later, allow_second_process, begin_beside
 from graphnav.core.errors import PartlyWrittenError, RecordingError
@@ -127,3 +128,20 @@ def test_what_was_ended_is_done_here_if_it_is_wanted_after_all() -> None:
     work = begin_beside(os.getpid)
     work.end()
     assert work.get_result() == os.getpid()
+
+
+def test_a_run_is_the_same_with_a_second_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The filter that is begun beside the search for faults, and used where nothing is wrong, has the same bytes."""
+    drive = load(Path(__file__).parents[2] / "data" / "tokyo").crop(0.0, 60.0)
+    begun: list[object] = []
+    work = Beside.get_result
+    monkeypatch.setattr(Beside, "get_result", lambda one: begun.append(one) or work(one))
+    alone = run(drive, solvers=("ekf", "rts"))
+    assert not begun
+    allow_second_process()
+    both = run(drive, solvers=("ekf", "rts"))
+    assert begun
+    for name, one in alone.items():
+        for field in ("R_nb", "p", "v", "ba", "bg"):
+            np.testing.assert_array_equal(getattr(one.states, field), getattr(both[name].states, field))
+        np.testing.assert_array_equal(one.covariance, both[name].covariance)
