@@ -22,10 +22,11 @@ from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.memory import return_memory
 from graphnav.core.notes import Note, Notes
 from graphnav.core.progress import Progress, send_progress, tell
-from graphnav.core.state import BLOCKS, DIM
+from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation.building import start_sigma
+from graphnav.estimation.dense import Dense
 from graphnav.estimation.faults.excluded import describe_faults, find_fault_spans
 from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, split_drive
 from graphnav.estimation.noise.files import MODES
@@ -290,7 +291,7 @@ def _solve(
     place = BLOCKS["p"]
     apart = compute_separation(
         frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
-        smoothed.states.p, add_curvature(smoothed.P[:, :DIM, :DIM], smoothed.states)[:, place, place],
+        smoothed.states.p, smoothed.P[:, place, place],
     )  # fmt: skip
     # a graph needs the memory itself
     forward, smoothed = forward.drop_covariances(), smoothed.drop_covariances()
@@ -339,7 +340,14 @@ def _solve(
         )
         for name in solvers
     }
-    return {name: shift_to_own_clocks(one, stamps) for name, one in by_name.items()}
+    return {name: shift_to_own_clocks(_curve(one), stamps) for name, one in by_name.items()}
+
+
+def _curve(solution: Solution) -> Solution:
+    """The solution with what an unknown heading makes of its positions to second order."""
+    P = add_curvature(solution.covariance, solution.states)
+    between = (replace(one, covariance=P) if isinstance(one, Dense) else one for one in solution.between)
+    return replace(solution, covariance=P, between=tuple(between))
 
 
 def check_profile(recording: Recording, settings: Settings) -> list[str]:

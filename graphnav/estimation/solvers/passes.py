@@ -19,7 +19,6 @@ from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_la
 from graphnav.estimation.solvers.recursion import Arrays, RowBlocks
 from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.stack import Innovations
-from graphnav.estimation.solvers.turning import add_curvature
 from graphnav.imu.dynamics import convert_to_biases
 
 LINEAR_ATTITUDE = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
@@ -230,7 +229,6 @@ def make_solution(
     found : other fields of the solution.
     """
     scale = scale_at(problem.columns, points.values)
-    covariance = add_curvature(covariance, points.states)
     return Solution(
         solver, problem.frame, problem.t, points.states, covariance, estimate_parameters(problem, points.values, sigma),
         counts={"initial_prior": 1, "imu": len(problem.t) - 1, **{c.name: len(c) for c in problem.constraints}},
