@@ -74,7 +74,7 @@ class Beside(Generic[T]):
     """Work that a second process has begun; it ends with this object, or with this process."""
 
     def __init__(self, work: Callable[[], T]) -> None:
-        self._work, self._given = work, _list_given(work)
+        self._work, self._given = work, _list_arguments(work)
         end, begin = os.pipe()
         with warnings.catch_warnings():  # of other threads, which hold no lock that the work needs
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -114,7 +114,7 @@ class Beside(Generic[T]):
         self._stop()
 
 
-def _list_given(work: Callable[[], object]) -> list[object]:
+def _list_arguments(work: Callable[[], object]) -> list[object]:
     """Everything in the arguments of work that can be large, in an order that depends on nothing else."""
     found: dict[int, object] = {}
     waiting: list[object] = [*work.args, *work.keywords.values()] if isinstance(work, partial) else []

@@ -154,7 +154,7 @@ class Sensors:
         buffer: Buffer = getattr(self, sensor)
         if sensor == "imu":
             return self._add_imu(t, values)
-        if not self._is_in_time(sensor, t, values, (sensor, t, *values[: _IDENTIFYING[sensor]]), released):
+        if not self._is_in_time(sensor, t, values, released):
             return False
         if sensor == "gnss":
             values, without = drop_insane_velocity(values)
@@ -178,11 +178,9 @@ class Sensors:
         self.counts[sensor] += 1
         return self.gnss.choose(t) if sensor == "gnss" else True
 
-    def _is_in_time(
-        self, sensor: str, t: float, values: tuple[float, ...], told: tuple[str | float, ...], released: bool
-    ) -> bool:
-        """Whether a row arrives in time to be used; a repeated row is recognised by `told`."""
-        if told in self._before:  # a sender that restarts before that step
+    def _is_in_time(self, sensor: str, t: float, values: tuple[float, ...], released: bool) -> bool:
+        """Whether a row arrives in time to be used, and is not repeated."""
+        if _identify(sensor, t, values) in self._before:  # a sender that restarts before that step
             self.counts[f"{sensor}: repeated"] += 1
             return False
         far_ahead = bool(len(self.imu)) and t > self.imu.newest + AHEAD
@@ -206,7 +204,7 @@ class Sensors:
             why = "not a number"
         elif not sensor.mask_usable(row := sensor.mask_outside_bounds(row))[0]:
             why = "beyond any sensor"
-        elif not self._is_in_time(name, t, values, _identify(name, t, values), released):
+        elif not self._is_in_time(name, t, values, released):
             return False
         elif not self.others[name].add(t, tuple(row[0].tolist())):
             why = "repeated"
@@ -220,7 +218,7 @@ class Sensors:
             why = "not a number"
         elif (why := self.raw.find_fault(values)) is not None:
             pass
-        elif not self._is_in_time(RAW, t, values, (RAW, t, len(values)), released):
+        elif not self._is_in_time(RAW, t, values, released):
             return False
         elif not self.raw.is_wanted(t):
             why = "closer than they are used"
@@ -304,14 +302,9 @@ class Sensors:
             if self._clock.hold(("imu", t, values)):
                 self.set_back = self._clock.set_back()  # counted when they are processed
                 self.counts -= Counter(self._name_passed(when) for sensor, when, _ in self.set_back if sensor == "imu")
-                for name, width in _IDENTIFYING.items():
-                    rows = getattr(self, name).rows[:, : width + 1].tolist()
-                    self._before = {one for one in self._before if one[0] != name} | {(name, *row) for row in rows}
-                for name, buffer in self.others.items():
-                    again = {_identify(name, t, tuple(values)) for t, *values in buffer.rows.tolist()}
+                for name, buffer in self.aiding.items():
+                    again = {_identify(name, *row) for row in buffer.list_after(-math.inf)}
                     self._before = {one for one in self._before if one[0] != name} | again
-                for t_before, values_before in [] if self.raw is None else self.raw.list_after(-math.inf):
-                    self._before.add((RAW, t_before, len(values_before)))
             self._sort_out()
             return False
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
@@ -398,6 +391,9 @@ class Sensors:
         return replace(self.setup.odometer, t=rows[:, 0], speed=rows[:, 1], counted=way, wheels=wheels)
 
 
-def _identify(name: str, t: float, values: tuple[float, ...]) -> tuple[str | float, ...]:
-    """The values by which a repeated row of another sensor is recognised."""
-    return (name, t, *(x for x in values if math.isfinite(x)))
+def _identify(sensor: str, t: float, values: tuple[float, ...]) -> tuple[str | float, ...]:
+    """What a repeated row is recognised by: its first values, those that are numbers, or how many an epoch has."""
+    if sensor == RAW:
+        return sensor, t, len(values)
+    some = values[: _IDENTIFYING[sensor]] if sensor in _IDENTIFYING else filter(math.isfinite, values)
+    return (sensor, t, *some)

@@ -104,7 +104,7 @@ def add_curvature(P: Array, states: States) -> Array:
     What a heading that is off by psi turns moves on a circle, and not on its tangent: inward by psi/2 times as far. To
     first order the part of a position that psi moves is off by psi c / var(psi), with c the covariance of both, so
     inward of that the mean square is (3/4) m m^T, of m = c turned by a quarter (E psi^4 = 3 var(psi)^2). Where fixes
-    bound the position c is nearly zero; of a walk whose heading is lost by 30 deg this is a fifth of its length.
+    bound the position, c is nearly zero.
     """
     theta, p = BLOCKS["theta"], BLOCKS["p"]
     m = np.einsum("kij,kj->ki", P[:, p, theta], states.R_nb[:, 2]) @ _Z.T
