@@ -6,6 +6,8 @@
 2. Nothing changes in a candidate, so neither does its speed: if the speeds measured inside show motion, all of it
    moves, and so do the spans that the force links to it (`graphnav.detectors.chain`). Where no speed was measured
    inside, the one measured last before it, and first after it, must be one that the force leads to from rest.
+   Nor does its rate of turn: one that differs from that of the other candidates by more than a bias changes is a
+   turn on the spot, of a tracked robot or of what the vehicle stands on.
 3. Two candidates are one stop if the force between them, integrated, leads from rest to rest without reaching a
    speed in between: a passenger moved, not the vehicle. In the fusion, what the FFT detector calls stationary next
    to a stop is added under the same condition.
@@ -18,6 +20,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.config.detectors import FusionSettings
 from graphnav.core.notes import Notes, format_count
@@ -57,6 +60,7 @@ _BLIND = 0.2  # share of moving windows that look stationary above which stillne
 _AROUND = 60.0  # s about a span in which an odometer must have moved for its zero to count
 _ENOUGH_MOTION = 20.0  # s of certain motion needed to estimate that share
 _CLEAR_MOTION = 10.0  # multiple of the low-band GLRT's threshold at which the vehicle clearly moves
+_BIAS_CHANGE = np.radians(1.0)  # rad/s: 0.05 deg/s/K of a consumer gyro (BMI160, data sheet) over 20 K
 _FILTER_REACH = 0.3  # s, of the low-pass filter: closer to the recording's ends no edge can be found
 
 
@@ -139,6 +143,7 @@ def find_candidates(scene: Scene, found: Detection, row: Scale) -> tuple[Array, 
     moves = np.array([_contradicts_speed(b, span, speeds, scene.settings.fusion) for span in spans]) & np.isnan(known)
     rest = np.flatnonzero(~moves)  # a moving vehicle may brake steadily: the integral of its force counts, not the mean
     moves[rest] = find_moving_by_chain([link(b, *pair) for pair in pairwise(spans[rest])], known[rest])
+    turns = ~moves & _find_turning(b, spans)
     notes = Notes()
     measured = int((np.nan_to_num(known) > 0.0).sum())
     if measured:
@@ -147,6 +152,11 @@ def find_candidates(scene: Scene, found: Detection, row: Scale) -> tuple[Array, 
         notes.add(
             "detectors.speed_felt",
             f"{_count(int(moves.sum()) - measured)} not taken as a stop: the force before or after shows motion",
+        )
+    if turns.any():
+        moves |= turns
+        notes.add(
+            "detectors.turning", f"{_count(int(turns.sum()))} not taken as a stop: the platform turns on the spot"
         )
     share = _share_still_in_motion(found, certain)
     if share > _BLIND:
@@ -176,6 +186,16 @@ def _screen_motion(b: BlockMeans, spans: Array, speeds: list[Speeds], certain: A
             fastest = max(float(s.speed[there].max()) for s in speeds if (there := (s.t >= begin) & (s.t <= end)).any())
             keep[k] = one.peak + one.tolerance >= fastest
     return certain[keep]
+
+
+def _find_turning(b: BlockMeans, spans: Array) -> NDArray[np.bool_]:
+    """Which of M spans (M, 2) turn steadily: those whose rate is not the one at which half of all their time is spent."""
+    inside = np.stack([(b.t > start) & (b.t < end) for start, end in spans])
+    counted = inside.any(axis=0)
+    if not counted.any():
+        return np.zeros(len(spans), dtype=bool)
+    excess = b.rate - compute_share(b.rate[counted], 0.5)
+    return np.array([of.any() and bool((np.abs(excess[of].mean(axis=0)) > _BIAS_CHANGE).any()) for of in inside])
 
 
 def _share_still_in_motion(found: Detection, certain: Array) -> float:

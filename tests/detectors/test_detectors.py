@@ -263,6 +263,19 @@ def test_a_passenger_is_bridged_and_a_hop_forward_is_not():
     assert np.abs(v[covered(t, found.stationary)]).max() < 2e-3
 
 
+def test_turning_on_the_spot_is_no_stop():
+    """A tracked robot turns without vibration at a constant rate, its odometer at zero."""
+    recording, t, _ = made(17, [(30, 0), (10, 0), (20, 0), (12, 0), (30, 0)], engine=0.0)
+    rate = np.radians(np.interp(t, [30, 31, 39, 40, 60, 61, 71, 72], [0, 20, 20, 0, 0, -30, -30, 0]))
+    gyro = recording.imu.gyro + np.outer(rate, [0.0, 0.0, 1.0])
+    turning = replace(recording, imu=replace(recording.imu, gyro=gyro))
+    stops = np.array([(0.0, 30.0), (40.0, 60.0), (72.0, 102.0)])
+    found, false = rates(detect(turning).stationary, stops, 0.0, 102.0)
+    assert found > 0.95
+    assert false < 0.02
+    np.testing.assert_allclose(detect(recording).stationary, [[t[0], t[-1]]], atol=0.02)
+
+
 def test_a_measured_speed_overrules_a_smooth_ride():
     # a road without any unevenness: the IMU alone cannot tell, the fixes can, and in their outage still the force
     recording, t, v = made(15, [(20, 0), (8, 15), (90, 15), (8, 0), (20, 0), (8, 15), (30, 15)], road=0.0, engine=0.0)

@@ -26,6 +26,7 @@ _NAMES = {
 
 _IMU_WHITE = dict(zip(INTERVALS, ("gyro noise", "accelerometer noise"), strict=True))
 _FAR = 5.0  # prior sigmas, beyond chance
+_ALONG = 0.75  # share of the squared speed along the axes of a vehicle with wheels: 30 deg of side slip, in the mean
 
 
 def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
@@ -69,7 +70,10 @@ def describe_turned_axes(problem: Problem, smoothed: Points) -> str | None:
     (a, b), states = value, smoothed.states
     up = np.array([0.0, np.sin(a), np.cos(a)])
     ahead = np.array([-np.sin(b), np.cos(b) * np.cos(a), -np.cos(b) * np.sin(a)])
-    if np.einsum("i,kji,kj", ahead, states.R_nb, states.v) < 0.0:  # which no sideways velocity tells
+    forward = np.einsum("i,kji,kj->k", ahead, states.R_nb, states.v)
+    if np.sum(forward**2) < _ALONG * np.sum(states.v**2):  # nothing with wheels: a boat that drifts
+        return None
+    if np.sum(forward) < 0.0:  # which no sideways velocity tells
         ahead = -ahead
     letters = write_letters(problem.recording.imu.R_bs, ahead, up)
     hint = f' (axes = "{letters}" would agree)' if letters else ""
