@@ -189,7 +189,7 @@ def _screen_motion(b: BlockMeans, spans: Array, speeds: list[Speeds], certain: A
 
 
 def _find_turning(b: BlockMeans, spans: Array) -> NDArray[np.bool_]:
-    """Which of M spans (M, 2) turn steadily: those whose rate is not the one at which half of all their time is spent."""
+    """Which of M spans (M, 2) turn steadily: whose mean rate is not the median of the rates in all of them."""
     inside = np.stack([(b.t > start) & (b.t < end) for start, end in spans])
     counted = inside.any(axis=0)
     if not counted.any():

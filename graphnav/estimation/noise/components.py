@@ -66,6 +66,18 @@ class Components:
         """The logarithm of their prior, up to a constant."""
         return -0.5 * sum(((x - m) / s) ** 2 for name, x in self.log.items() for m, s in [self.get_prior(name)])
 
+    def doubt_wheels(self, problem: Problem) -> None:
+        """Begin with what rests on wheels that do not slip as bad as its prior's 1-sigma makes it.
+
+        A constraint that is too tight bends the trajectory, and other sensors come out too noisy, from where no step
+        leads back; one that is too loose shows how well it holds.
+        """
+        for rows in problem.constraints:
+            if rows.of_wheels:
+                own = rows.list_noise_groups()[0], *(p.noise_groups for p in rows.processes)
+                for name in {name for groups in own for name in groups}:
+                    self.log[name] += get_prior(name)[1]
+
     def update(self, name: str, A: float, B: float) -> None:
         """One step of a component with sum of squares A and redundancy B."""
         m, s = self.get_prior(name)

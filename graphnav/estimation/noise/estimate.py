@@ -127,6 +127,8 @@ def estimate_noise(
         figures.weights |= initial.weights
         for name, more in initial.log_factors.items():
             figures.log[name] += more
+        if start is None:
+            figures.doubt_wheels(problem)
         try:
             found.append(_iterate(problem, figures, initial.points, progress, intervals))
         except BREAKDOWN:  # from these points; others may succeed
