@@ -139,7 +139,8 @@ class Truth:
     xyz: Array | None = None  # (M, 2 or 3) m in a local frame of unknown origin and yaw
     v: Array | None = None  # (M, 3) m/s, local ENU, NaN where absent
     rph: Array | None = None  # (M, 3) rad, NaN where absent
-    of: str = "imu"  # the point it refers to: "imu", "gnss", "odometer"
+    # the point it refers to: "imu", "gnss", "odometer", or that many m right, forward, up of the IMU
+    of: str | tuple[float, float, float] = "imu"
     closed_loop_sigma: float | None = None  # m; the end is the start
 
 

@@ -269,7 +269,7 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
     # truth and keep
     "truth of unknown": (
         toml('file = "truth.csv"', 'file = "truth.csv"\nof = "camera"'),
-        ("key.value", "'truth.of' = 'camera'"),
+        ("key.value", "'truth.of'", "'camera'"),
     ),
     "truth of nobody": (
         both(toml('[odometer]\nfile = "odometer.csv"', ""), toml('"truth.csv"', '"truth.csv"\nof = "odometer"')),

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.plain import Plain, add_words
+from graphnav.recording.formats import columns as matching
 from graphnav.recording.formats.places import is_in_degrees_and_minutes, is_in_whole_degrees
 from graphnav.recording.formats.table import Table
 

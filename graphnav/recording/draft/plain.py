@@ -16,7 +16,7 @@ from graphnav.core.files import is_blank, open_file, parse_number, read_bytes
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import DAY
 from graphnav.recording.draft.angles import read_angles
-from graphnav.recording.draft.columns import NAMED_UNITS, match_columns, split_unit
+from graphnav.recording.formats.columns import NAMED_UNITS, match_columns, split_unit
 from graphnav.recording.formats.text import NumberedLines
 
 _START = 1 << 16  # bytes that contain the header

@@ -219,6 +219,8 @@ def build_truth(d: schema.TruthTable, rows: Table, remarks: Notes) -> Truth:
         xyz = rows.stack("x", "y", "z") if "z" in rows else rows.stack("x", "y")
     else:
         llh, rows = convert_geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "truth", remarks)
+    if "vd" in rows and "vu" not in rows:
+        rows = rows.with_column("vu", -rows["vd"])
     v = _read_part(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
     rph = _read_part(rows, ("roll", "pitch", "heading"), ANGLE[d.units.angle or "deg"])
     return Truth(rows["t"], llh, xyz, v, rph, d.of)

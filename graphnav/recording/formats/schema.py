@@ -19,7 +19,7 @@ from pydantic import (
 )
 from pydantic.types import Strict
 
-from graphnav.core.complaints import describe_invalid, read_toml, suggest_nearest
+from graphnav.core.complaints import describe_invalid, read_toml, shorten, suggest_nearest
 from graphnav.core.earth import MG, STANDARD_GRAVITY
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
@@ -273,15 +273,27 @@ class OdometerTable(SensorTable):
         return ("speed",)
 
 
+def _point(value: Any) -> Any:
+    if value in ("imu", "gnss", "odometer"):
+        return value
+    try:
+        return check_three_numbers(value)
+    except ValueError:
+        words = 'must be "imu", "gnss", "odometer" or three numbers in brackets'
+        raise ValueError(f"{words}, not {shorten(value)}") from None
+
+
 class TruthTable(SensorTable):
     """[truth]"""
 
     required = ("t",)
-    optional = ("lat", "lon", "h", "x", "y", "z", "ve", "vn", "vu", "roll", "pitch", "heading")
+    optional = ("lat", "lon", "h", "x", "y", "z", "ve", "vn", "vu", "vd", "roll", "pitch", "heading")
 
     file: str | None = Field(None, min_length=1)  # type: ignore[assignment]
     units: GnssUnits = GnssUnits()
-    of: Literal["imu", "gnss", "odometer"] = "imu"
+    of: Annotated[str | tuple[float, float, float], BeforeValidator(_point)] = Field(
+        "imu", description="its point: that of a sensor, or m right, forward, up of the IMU"
+    )
     frame: Literal["geodetic", "local"] = "geodetic"
     closed_loop_sigma: Positive | None = Field(None, description="m, from the start to the end")
 
@@ -319,7 +331,7 @@ class RecordingFile(TomlTable):
     @model_validator(mode="after")
     def _truth_of_a_sensor(self) -> RecordingFile:
         of = self.truth.of if self.truth else "imu"
-        if getattr(self, of) is None and not (of == "gnss" and self.raw_gnss is not None):
+        if isinstance(of, str) and getattr(self, of) is None and not (of == "gnss" and self.raw_gnss is not None):
             raise ValueError(f"truth.of = '{of}', but there is no [{of}] table whose lever arm would apply")
         return self
 

@@ -92,6 +92,13 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     "resid_rms_m": (r"resid(?:ual)?s?_?rms(?:_m)?", r"rms_?(?:of_?)?resid(?:ual)?s?(?:_m)?"),
 }  # fmt: skip
 
+# of a reference beside fixes, whose course may be called its heading
+_ATTITUDE_PATTERNS = {
+    "roll": (r"(?:.*_)?roll(?:_angle)?",), "pitch": (r"(?:.*_)?pitch(?:_angle)?",),
+    "heading": (r"(?:.*_)?(?:heading|azimuth|hdg)(?:_angle)?", r"(?:.*_)?yaw(?:_angle)?"),
+}  # fmt: skip
+ATTITUDE = tuple(_ATTITUDE_PATTERNS)
+
 NAMED_UNITS = {
     "s": ("t", "s"), "sec": ("t", "s"), "seconds": ("t", "s"), "ms": ("t", "ms"), "us": ("t", "us"), "ns": ("t", "ns"),
     "dps": ("gyro", "deg/s"), "deg_s": ("gyro", "deg/s"), "degps": ("gyro", "deg/s"), "deg_sec": ("gyro", "deg/s"),
@@ -120,7 +127,7 @@ class FileColumns:
 
     @property
     def sensor(self) -> str | None:
-        """The sensor of the file, a key of `logs.WANTED`, or None; gravity is a phone's own estimate of it."""
+        """The sensor of the file, as `graphnav.recording.draft.logs` names them, or None; gravity is a phone's own."""
         gyro, accel = ({f"{s}{x}" for x in "xyz"} <= self.names.keys() for s in "ga")
         if "t" not in self.names:
             return None
@@ -168,6 +175,18 @@ def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
             for x in "xyz":
                 names.pop(f"{kind}{x}", None)
     return FileColumns(names, units)
+
+
+def match_attitude(header: Sequence[str]) -> FileColumns:
+    """Match the columns of roll, pitch and heading."""
+    spelt = [some for name in header if not _UNCERTAIN.fullmatch((some := (name, *split_unit(name)))[1])]
+    found = {
+        ours: one
+        for ours, patterns in _ATTITUDE_PATTERNS.items()
+        for one in [next((some for p in patterns for some in spelt if re.fullmatch(p, some[1])), None)]
+        if one is not None
+    }
+    return FileColumns({o: one[0] for o, one in found.items()}, {o: one[2] for o, one in found.items() if one[2]})
 
 
 def find_wheels(header: Sequence[str]) -> list[str]:
