@@ -21,6 +21,7 @@ from graphnav.recording.draft.conversion import (
     convert_variances,
     convert_whole_degrees,
     convert_whole_velocities,
+    divide_increments,
 )
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.motion import is_course_in_radians
@@ -367,6 +368,8 @@ def read_sensor(
         if counted:
             plain = convert_whole_velocities(names, values, values["t"] * TIME_UNITS[str(unit.value)], plain)
     columns, names, plain = convert_small_units(columns, names, values, plain)
+    if inertial:
+        columns, names, plain = divide_increments(columns, names, values, TIME_UNITS[str(unit.value)], plain)
     step = np.diff(values["t"])
     if step.sum() > _PAUSES * len(step) * np.median(step):
         k = int(np.argmax(step))

@@ -15,6 +15,9 @@ _ACCEL = (
     r"(?:.*_)?(?:acc\w*?|g_?force|beschleunigung|acel\w*?|linear_acceleration|total_acceleration|specific_force|imu_a|imu_f|force"
     r"|a|f)_?"
 )
+# increments over a sample
+_TURN = r"(?:.*_)?(?:d(?:el(?:ta)?)?_?(?:theta|ang(?:le)?)|angle?_?inc(?:rement)?)_?"
+_PUSH = r"(?:.*_)?(?:d(?:el(?:ta)?)?_?v(?:el(?:ocity)?)?|vel(?:ocity)?_?inc(?:rement)?)_?"
 _HORIZONTAL = r"sd_?h|(?:.*_)?(?:h_?acc\w*|horizontal_accuracy)|accuracy|eph|epe(?:_m)?"
 _VERTICAL = r"sd_?v|(?:.*_)?(?:v_?acc\w*|vertical_accuracy)|altitude_accuracy|epv"
 _COVARIANCE = r"(?:.*_)?position_cov(?:ariance)?_?"  # of ROS, 3 x 3 by rows, east, north, up
@@ -36,8 +39,8 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"date_?time|unix|epoch|utc|(?:uhr)?zeit(?:stempel)?|clock|hora|heure|tiempo|temps|date|datum|millis|micros|ms|us|ns",
     ),
     "week": (r"(?:gps_?)?(?:week|wn)(?:_?(?:no|num|number))?",),
-    **{f"g{x}": (rf"{_GYRO}{x}",) for x in "xyz"},
-    **{f"a{x}": (rf"{_ACCEL}{x}",) for x in "xyz"},
+    **{f"g{x}": (rf"{_GYRO}{x}", rf"{_TURN}{x}") for x in "xyz"},
+    **{f"a{x}": (rf"{_ACCEL}{x}", rf"{_PUSH}{x}") for x in "xyz"},
     "lat": (r"(?:.*_)?lat(?:itude?)?", r"breite(?:ngrad)?"),
     "lon": (r"(?:.*_)?(?:lon|lng|long|longitude?)", r"l_nge(?:ngrad)?|laenge(?:ngrad)?"),
     "h": (
@@ -165,6 +168,8 @@ def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
             names[f"{kind}{x}"] = bare[x][0]
             if bare[x][1]:
                 units[f"{kind}{x}"] = bare[x][1]
+    if names.get("speed") in {names.get(f"a{x}") for x in "xyz"}:
+        names.pop("speed", None)
     if {"lat", "lon"} <= names.keys() and split_unit(names.get("speed", ""))[0].endswith("x"):
         del names["speed"]  # one of three components, in axes that are not stated
     if "week" in names and not re.fullmatch(_OF_WEEK, split_unit(names.get("t", ""))[0]):
@@ -175,6 +180,11 @@ def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
             for x in "xyz":
                 names.pop(f"{kind}{x}", None)
     return FileColumns(names, units)
+
+
+def is_increment(name: str) -> bool:
+    """Whether a column of an IMU is called as increments of angle or velocity are."""
+    return re.fullmatch(rf"(?:{_TURN}|{_PUSH})[xyz]", split_unit(name)[0]) is not None
 
 
 def match_attitude(header: Sequence[str]) -> FileColumns:

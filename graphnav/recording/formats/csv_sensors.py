@@ -12,6 +12,7 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Truth
 from graphnav.recording.formats import schema
+from graphnav.recording.formats.increments import compute_periods, note_gaps
 from graphnav.recording.formats.places import convert_geodetic
 from graphnav.recording.formats.pulses import count_pulses
 from graphnav.recording.formats.repair import (
@@ -36,8 +37,15 @@ _SD_V = ("sd_ve", "sd_vn", "sd_vu")
 def build_imu(d: schema.ImuTable, rows: Table, remarks: Notes) -> Imu:
     """Samples in body axes RFU, rad/s and m/s^2, with the stated noise figures, else a consumer IMU's."""
     R_bs = d.R_bs
-    gyro = _take_in_body(rows, ("gx", "gy", "gz"), schema.RATE_UNITS[d.units.gyro], R_bs)
-    accel = _take_in_body(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
+    turned, pushed = d.units.gyro in schema.ANGLE_STEPS, d.units.accel in schema.VELOCITY_STEPS
+    gyro = _take_in_body(rows, ("gx", "gy", "gz"), (schema.RATE_UNITS | schema.ANGLE_STEPS)[d.units.gyro], R_bs)
+    accel = _take_in_body(rows, ("ax", "ay", "az"), (schema.FORCE | schema.VELOCITY_STEPS)[d.units.accel], R_bs)
+    if turned or pushed:
+        dt, gap = compute_periods(rows["t"])
+        note_gaps(gap, remarks)
+        for steps, some in ((turned, gyro), (pushed, accel)):
+            if steps:
+                some /= dt[:, None]
     stated = d.figures
     noise = replace(ImuNoise(), **stated)
     missing = [key for key in schema.STATED_FIGURES if key not in stated]

@@ -64,11 +64,22 @@ _LETTERS = {"R": (1, 0, 0), "L": (-1, 0, 0), "F": (0, 1, 0), "B": (0, -1, 0), "U
 
 
 class ImuUnits(TomlTable):
-    """Units of imu.csv."""
+    """Units of an IMU's rates and forces."""
 
     t: TimeUnit = "s"
     gyro: Literal["rad/s", "deg/s", "mdeg/s"] = "rad/s"
     accel: Literal["m/s2", "g", "mg", "ft/s2", "-m/s2", "-g"] = "m/s2"
+
+
+# of increments over a sample, in files
+ANGLE_STEPS, VELOCITY_STEPS = {"rad": 1.0, "deg": np.pi / 180.0}, {"m/s": 1.0}
+
+
+class ImuFileUnits(ImuUnits):
+    """Units of imu.csv, which may hold increments of angle and velocity over each sample."""
+
+    gyro: Literal["rad/s", "deg/s", "mdeg/s", "rad", "deg"] = "rad/s"  # type: ignore[assignment]
+    accel: Literal["m/s2", "g", "mg", "ft/s2", "-m/s2", "-g", "m/s"] = "m/s2"  # type: ignore[assignment]
 
 
 class GnssUnits(TomlTable):
@@ -161,6 +172,8 @@ class ImuTable(ImuDescription, SensorTable):
     """[imu]"""
 
     required = ("t", "gx", "gy", "gz", "ax", "ay", "az")
+
+    units: ImuFileUnits = ImuFileUnits()
 
 
 GEOID = "geoid"  # added to h, only where `columns` names it: in other files h may be above the ellipsoid already
