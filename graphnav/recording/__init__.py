@@ -171,6 +171,10 @@ class Recording:
     sensors: Mapping[str, Series] = field(default_factory=dict)  # other sensors (`graphnav.sensors`), by name
     own: Own = Own()  # as passed to `graphnav.run`
 
+    def __repr__(self) -> str:
+        rows = "".join(f", {name} {len(one.t)}" for name, one in {"imu": self.imu, **self.aiding}.items())
+        return f"Recording({self.name!r}, {self.platform}, {self.duration:.1f} s{rows} rows)"
+
     @cached_property
     def start(self) -> float:
         """Start of the first IMU period: zero of the recording's own clock, s."""
