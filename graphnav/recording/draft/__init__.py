@@ -236,6 +236,10 @@ class _Writer:
                 dropped = (*dropped, "type")
                 self.file.decide(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
         missing = {"sd_e", "sd_n", "sd_u"} - values.keys()
+        if missing == {"sd_u"}:
+            theirs = source.columns.names["sd_e"]
+            self.file.decide(f"sigmas: '{theirs}' is that of each horizontal axis, heights twice as uncertain")
+            missing = set()
         if missing:  # all three or none
             dropped = (*dropped, "sd_e", "sd_n", "sd_u")
         if source.log is None and has_attitude(source):
@@ -274,9 +278,7 @@ class _Writer:
                 units["speed"] = Guess(stated, "as the column's name says")
             self.file.write_units(units)
             if missing:
-                none = (
-                    "none" if len(missing) == 3 else f"none {'of heights' if missing == {'sd_u'} else 'of all three'}"
-                )
+                none = "none" if len(missing) == 3 else "none of all three"
                 why = (
                     f"CHECK: m, 1-sigma east, north, up; the file states {none}, this is a receiver without corrections"
                 )

@@ -314,6 +314,11 @@ def read_sensor(
     else:
         own = {ours: plain.columns[theirs] for ours, theirs in names.items()}
         table = Table(path, own, names, np.arange(len(own["t"])))
+    for ours in names:
+        if role != "odometer" and len(bad := np.flatnonzero(np.isinf(table[ours]))):
+            raise RecordingError(
+                f"{table.describe_place(bad[0], ours)}: the value is infinite; leave it blank", key="table.not_finite"
+            )
     needed = [n for n in wanted[: _NEEDED.get(role, len(wanted))] if n in names]
     whole = np.asarray(np.isfinite(table.stack(*needed)).all(-1))
     if role in PLACED:

@@ -62,7 +62,11 @@ def select_usable_rows(
         if len(bad) and sensor == "odometer":  # of which single readings can be missing
             rows = rows.with_column(name, np.where(np.isinf(rows[name]), np.nan, rows[name]))
         elif len(bad):
-            what = f"{stamps[bad[0]]:.16g} is no time in {unit}" if name == "t" else "the value is infinite"
+            what = (
+                f"{stamps[bad[0]]:.16g} is no time in {unit}"
+                if name == "t"
+                else "the value is infinite; leave it blank"
+            )
             dates = [other for other, scale in TIME_UNITS.items() if UNIX < stamps[bad[0]] * scale < 3.0 * UNIX]
             hint = f'; say units = {{ t = "{dates[0]}" }}: it is then a date' if name == "t" and dates else ""
             raise RecordingError(f"{rows.describe_place(bad[0], name)}: {what}{hint}", key="table.not_finite")
@@ -226,6 +230,11 @@ def choose_sigmas(
     """
     of = what.lower().replace(" ", "_")  # gnss_position
     there = [name for name in names if name in rows]
+    if there == ["sd_e", "sd_n"]:  # as of phones: heights are twice as uncertain
+        up = np.hypot(rows["sd_e"], rows["sd_n"]) * np.sqrt(2.0)
+        rows, there = rows.with_column("sd_u", up if stated is None else np.full(len(rows), stated[2])), list(names)
+        taken = "twice the horizontal ones are" if stated is None else "that of sd in [gnss] is"
+        remarks.add(f"{of}.sigma_partly", f"{what} sigmas of heights: no column sd_u: {taken} taken")
     fallback = np.array(stated or default)
     assumed = f"{what} sigmas of {default[0]:g}, {default[1]:g}, {default[2]:g} (east, north, up) are assumed"
     if len(there) < 3:
