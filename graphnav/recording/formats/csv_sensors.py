@@ -31,6 +31,7 @@ from graphnav.sensors import Sensor, Series
 from graphnav.sensors.tables import ANGLE
 
 _ROWS_AT_ONCE = 1 << 16  # rows at once
+_FASTEST = 300.0  # m/s; larger ones stand for none (999)
 _SD_V = ("sd_ve", "sd_vn", "sd_vu")
 
 
@@ -108,6 +109,14 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Notes) -> Gnss:
     if len(there) == 3:
         v = rows.stack("ve", "vn", "vu") * scale
         absent = np.isnan(v).any(-1)
+        beyond = ~absent & (np.linalg.norm(v, axis=1) > _FASTEST)
+        if 0 < beyond.sum() < 0.5 * len(v):  # else in another unit
+            remarks.add(
+                "gnss.velocity_beyond",
+                f"{format_count(beyond.sum(), 'GNSS velocity', 'GNSS velocities')} of more than {_FASTEST:g} m/s, "
+                f"which no land vehicle reaches, left out (first at t = {rows['t'][beyond][0]:.3f} s)",
+            )
+            absent |= beyond
         v[absent] = np.nan
         sd_v = choose_sigmas(rows, _SD_V, d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
         absent |= (sd_v > VAGUEST_V).any(-1)

@@ -23,6 +23,7 @@ _LEAST_SIGMA = 1e-9  # m, m/s; a smaller sigma is not meant as one
 _SET_BACK_PERIODS = 10.0  # periods; rows that overtake each other are closer
 _PAUSE = 1.0  # s; longer steps of an IMU are gaps
 _BURST = 0.3  # ratio of median to mean step below which rows come in bursts
+_ROUNDED_AWAY = 0.05  # share of the stamps that repeat the one before, where a rounding makes them
 _REPEATED = 0.6  # share of rows with the stamp of the previous row above which the log is refused
 
 
@@ -116,7 +117,7 @@ def select_usable_rows(
         remarks.add(
             f"{sensor}.rows_repeated",
             f"{format_row_count(repeated, label)} with the time of the row before dropped "
-            f"(first at t = {t[repeated][0]:.3f} s)",
+            f"(first at t = {t[repeated][0]:.3f} s){_tell_rounding(stamps, repeated)}",
         )
         rows = rows.take(~repeated)
     if sensor == "imu":
@@ -126,6 +127,15 @@ def select_usable_rows(
         held = format_row_count(~new, "GNSS")
         remarks.add("gnss.held", f"{held} with the fix of the row before left out, {len(rows)} kept")
     return rows
+
+
+def _tell_rounding(stamps: Array, repeated: NDArray[np.bool_]) -> str:
+    """'; ...' where stamps (N,), in the file's unit, repeat because they went through single precision."""
+    known = stamps[np.isfinite(stamps)]
+    step = np.spacing(np.float32(np.abs(known).max())) if len(known) else 0.0
+    if repeated.mean() < _ROUNDED_AWAY or not np.array_equal(known, known.astype(np.float32)):
+        return ""
+    return f": stamps are rounded to {step:g}, as single-precision numbers are; write them with double precision"
 
 
 def find_repeated(path: Path, t: Array) -> NDArray[np.bool_]:
