@@ -301,6 +301,7 @@ MISTAKES: dict[str, list[Mistake]] = {
             SMOOTH,
             True,
         ),
+        Mistake("increments for rates", scaled("imu", "gx gy gz ax ay az", 0.02), ("increments", 'accel = "m/s"')),
         Mistake("ft/s2 for m/s2", scaled("imu", "ax ay az", 1 / 0.3048), ("in ft/s2", 'accel = "ft/s2"')),
         Mistake(
             "the accelerometer at half its scale", scaled("imu", "ax ay az", 0.5), ("2 times too small", "multiply")

@@ -21,7 +21,7 @@ from graphnav.app import cli
 from graphnav.app.terminal import StagePace
 from graphnav.config import PROFILES, Settings, format_settings, parse_settings, read_settings
 from graphnav.core import staging
-from graphnav.core.errors import ConfigError
+from graphnav.core.errors import ConfigError, EstimationError
 from graphnav.core.progress import send_progress, tell
 from graphnav.evaluation import gates
 
@@ -349,6 +349,16 @@ def test_a_call_of_run_takes_one_name_and_says_what_it_cannot_take():
     solution = run(recording, Settings(noise={"mode": "stated"}), "rts")["rts"]
     times, states, covariance = solution.at(np.array([recording.end + 10.0]))
     assert (len(times), len(states), covariance.shape) == (0, 0, (0, 15, 15))
+    middle = solution.t[0] + 0.37 * (solution.t[-1] - solution.t[0])
+    times, states, covariance = solution.at([recording.end, middle])  # in any order
+    assert np.array_equal(times, [middle, recording.end])
+    t, one, P = solution.at(middle)
+    assert np.array_equal(t, times[:1])
+    assert np.abs(one.p - states.p[:1]).max() < 1e-9
+    assert np.abs(P / covariance[:1] - 1.0).max() < 1e-6
+    with refused("option.value", EstimationError, "-1 Hz"):
+        solution.trajectory(rate=-1.0)
+    assert all(len(repr(what)) < 100 for what in (recording, solution, states, solution.trajectory()))
     with refused("run.argument", ConfigError, "Recording", "load"):
         run("data/tokyo")  # type: ignore[arg-type]
     with refused("run.argument", ConfigError, "Settings", "dict"):

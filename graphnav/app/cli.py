@@ -204,6 +204,14 @@ def evaluate(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder for evaluation.json and errors.csv.")
     ] = None,
+    point: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="Point that TRUTH is of: m right, forward, up of TRAJECTORY's; default: the same, or as a recording "
+            "says.",
+        ),
+    ] = None,
     require: Require = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -214,16 +222,18 @@ def evaluate(
     Both may be of graphnav or of another program.
     """
     from graphnav.app import outputs
+    from graphnav.app.convert import parse_arm
     from graphnav.core.staging import stage_results
     from graphnav.evaluation import gates
     from graphnav.evaluation.evaluate import evaluate as compared
     from graphnav.evaluation.metrics import format_metrics, summarise, tabulate
 
     requirements = [gates.parse_requirement(one) for one in require or ()]
+    arm = None if point is None else parse_arm(point, "--point")
     folder = None if out is None else outputs.check_output_folder(out)
     with show_progress(quiet, "evaluate"):
         tell("reading")
-        metrics = compared(trajectory, truth, allow_outside=allow_outside)
+        metrics = compared(trajectory, truth, lever_arm=arm, allow_outside=allow_outside)
     values = {"trajectory": str(trajectory), "truth": str(truth), **summarise(metrics)}
     verdicts = gates.judge_all(requirements, tabulate({trajectory.stem: metrics}))
     if verdicts:

@@ -115,13 +115,24 @@ def parse_point(text: str | None, option: str = "--point") -> str | Array:
     if text in (None, "imu", "antenna"):
         return text or "imu"
     assert text is not None
+    return parse_arm(text, option, "imu, antenna, or ")
+
+
+def parse_arm(text: str, option: str, else_: str = "") -> Array:
+    """Parse a lever arm ``x,y,z`` (m; right, forward, up); `else_` is what else may be written.
+
+    Raises
+    ------
+    ConfigError
+        If it is none.
+    """
     try:
         arm = np.array([float(x) for x in text.split(",")])
     except ValueError:
         arm = np.empty(0)
     if arm.shape != (3,) or not np.isfinite(arm).all():
         raise ConfigError(
-            f"{option} {text}: write imu, antenna, or x,y,z in m: right, forward, up of the IMU", key="option.point"
+            f"{option} {text}: write {else_}x,y,z in m: right, forward, up of the IMU", key="option.point"
         )
     return arm
 

@@ -220,7 +220,7 @@ def write_solver(
     folder.mkdir(parents=True, exist_ok=True)
     utc = None if zero is None else lambda t: gps_to_utc(t + zero)
     write_parts(solution.blocks(outcome.request.rate), targets, title, utc)
-    write_json(folder / "calibration.json", {key: _list_calibration(p) for key, p in solution.parameters.items()})
+    write_json(folder / "calibration.json", {key: _list_calibration(key, p) for key, p in solution.parameters.items()})
     text = format_detections(solution.detections, solution.records)
     (folder / "detections.csv").write_text(text, encoding="utf-8")
     done = time.perf_counter()
@@ -291,8 +291,9 @@ def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) 
     (folder / "errors.csv").write_text(head + body, encoding="utf-8")
 
 
-def _list_calibration(p: ParameterEstimate) -> dict[str, Any]:
+def _list_calibration(name: str, p: ParameterEstimate) -> dict[str, Any]:
     """A constant as its value, a time-varying parameter as its nodes, with the digits of trajectory.csv."""
+    from graphnav.estimation.names import name_components
     from graphnav.recording.exporters.digits import format_json_rows
 
     nodes: dict[str, Any] = {"value": p.value[0], "sigma": p.sigma[0]}
@@ -301,7 +302,8 @@ def _list_calibration(p: ParameterEstimate) -> dict[str, Any]:
         nodes |= {key: partial(format_json_rows, x, "%.6g") for key, x in (("value", p.value), ("sigma", p.sigma))}
     elif len(p.t) > 1:
         nodes = {"t": p.t, "value": p.value, "sigma": p.sigma}
-    return {"unit": p.unit, **nodes, "prior_sigma": p.prior_sigma, "seen_by_the_data": p.observable}
+    names = [one.words for one in name_components(name, p.value.shape[1], p.unit)]
+    return {"names": names, "unit": p.unit, **nodes, "prior_sigma": p.prior_sigma, "seen_by_the_data": p.observable}
 
 
 def _list_findings(outcome: Outcome) -> list[str]:

@@ -22,6 +22,8 @@ _MAX_QUOTED = 60  # characters of a value quoted in a sentence at most
 _TOML_PLACE = re.compile(r" \(at line (\d+), column (\d+)\)$")  # of tomllib's errors
 _LONG = re.compile(rf"\S{{{2 * _MAX_QUOTED},}}")  # a quoted value, as no sentence of graphnav has a word of this length
 _DEEPEST = 50  # levels of nested tables at most; graphnav's own files have four
+# keys of recording.toml that are put into a file of settings
+_OF_RECORDINGS = {"file", "axes", "columns", "units", "lever_arm", "sd", "sd_v", "time_offset", "noise", "platform"}
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
 
 
@@ -53,7 +55,19 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
         where, what = f"{path}", str(cause)
         if place := _TOML_PLACE.search(what):
             where, what = f"{path}, line {place[1]}, column {place[2]}", what[: place.start()]
-        raise error(f"{where}: not valid TOML: {what[:1].lower()}{what[1:]}", key="toml.syntax") from None
+        what = _rephrase_toml(f"{what[:1].lower()}{what[1:]}")
+        raise error(f"{where}: not valid TOML: {what}", key="toml.syntax") from None
+
+
+def _rephrase_toml(what: str) -> str:
+    """What to do about an error of tomllib."""
+    if found := re.match(r"cannot (?:declare|mutate immutable namespace) \((.*?),?\)", what):
+        return (
+            f"[{'.'.join(re.findall(r'[^ ,]+', found[1])).replace(chr(39), '')}] is there twice: make one table of both"
+        )
+    if what == "cannot overwrite a value":
+        return "the key is there twice: take one out"
+    return f"{what}: write / in paths" if what.startswith("unescaped '\\'") else what
 
 
 def check_whole_numbers(values: Any) -> None:
@@ -179,6 +193,8 @@ def _suggest(loc: tuple[str, ...], model: type[BaseModel]) -> str:
             elsewhere.setdefault(name, at)
     if loc[-1] in elsewhere:
         return f"; did you mean '{loc[-1]}' in [{'.'.join(elsewhere[loc[-1]])}]?"
+    if model.__name__ == "Settings" and loc[-1] in _OF_RECORDINGS:
+        return "; it is a key of recording.toml"
     if close := difflib.get_close_matches(loc[-1], known, n=1, cutoff=0.5):
         return f"; did you mean '{close[0]}'?"
     if close := difflib.get_close_matches(loc[-1], list(elsewhere), n=1, cutoff=0.8):

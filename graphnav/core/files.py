@@ -25,7 +25,21 @@ from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 
 MAX_FILE, MAX_LINE = "GRAPHNAV_MAX_FILE_MB", "GRAPHNAV_MAX_LINE_KB"
 _DEFAULTS = {MAX_FILE: 2000, MAX_LINE: 1000}
-_NOTHING = {"na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "nan(ind)", "-nan(ind)"}
+_NOTHING = {
+    "na",
+    "n/a",
+    "#n/a",
+    "null",
+    "none",
+    "nil",
+    "-",
+    "--",
+    "nan(ind)",
+    "1.#ind",
+    "1.#qnan",
+    "1.#snan",
+    "nan(snan)",
+}
 _WRITTEN = 64 << 20  # bytes at most of a file that is read as a whole: settings, descriptions, summaries
 _RATIO, _SMALL = 200, 8 << 20  # the size check of a packed log matters only beyond this many bytes
 _READ_SIZE = 1 << 16
@@ -185,7 +199,7 @@ def parse_json(text: str) -> Any:
 
 def is_blank(cell: str) -> bool:
     """Whether a cell of a table is empty, or holds one of the words that programs write for nothing."""
-    return not cell or cell.lower() in _NOTHING
+    return not cell or not _NOTHING.isdisjoint((cell.lower(), cell.lower().lstrip("+-")))
 
 
 def parse_number(text: str) -> float:

@@ -118,6 +118,9 @@ class States:
     def __len__(self) -> int:
         return len(self.p)
 
+    def __repr__(self) -> str:
+        return f"States of {len(self)} epochs"
+
     def __getitem__(self, index: slice | NDArray[Any]) -> States:
         if isinstance(index, slice) or index.dtype == bool:
             return States(self.R_nb[index], self.p[index], self.v[index], self.ba[index], self.bg[index])

@@ -40,6 +40,9 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.t)
 
+    def __repr__(self) -> str:
+        return f"Trajectory({self.name!r}, {len(self)} rows)"
+
     @property
     def R_lb(self) -> Array | None:
         """Rotation from body to local ENU, (K, 3, 3)."""

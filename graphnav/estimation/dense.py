@@ -22,6 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM, States, split_covariance
 from graphnav.estimation.problem import Problem
@@ -31,7 +32,15 @@ from graphnav.imu.samples import Samples
 
 
 def list_times(start: float, end: float, rate: float) -> Array:
-    """Multiples of 1/rate between two times (s), and both ends."""
+    """Multiples of 1/rate between two times (s), and both ends.
+
+    Raises
+    ------
+    EstimationError
+        If the rate is not above zero.
+    """
+    if not 0.0 < rate < np.inf:
+        raise EstimationError(f"a rate of {rate:g} Hz: it must be above zero", key="option.value")
     steps = np.arange(np.ceil(start * rate), np.floor(end * rate) + 1) / rate
     inner = steps[(steps > start + 1e-6) & (steps < end - 1e-6)]
     return np.concatenate([[start], inner, [end]])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
@@ -243,24 +244,27 @@ class Solution:
                 t = times[k : k + _BLOCK_ROWS]
                 yield make_trajectory(self.solver, self.frame, t, *piece.interpolate_blocks(t))
 
-    def at(self, t: Array) -> tuple[Array, States, Array]:
+    def __repr__(self) -> str:
+        return f"Solution({self.solver!r}, {len(self.t)} keyframes)"
+
+    def at(self, t: ArrayLike) -> tuple[Array, States, Array]:
         """States between the keyframes.
 
         Parameters
         ----------
         t
-            (N,) s, ascending.
+            (N,) s, or one time.
 
         Returns
         -------
         times : array
-            (M,) s, those of `t` that lie in a piece of the recording.
+            (M,) s, those of `t` that lie in a piece of the recording, ascending.
         states : States
             M states in the navigation frame.
         covariance : array
             (M, 15, 15) of the error state of `graphnav.core.state`.
         """
-        parts = []
+        t, parts = np.sort(np.atleast_1d(np.asarray(t, dtype=float))), []
         for piece in self.between:
             inside = t[(t >= piece.start) & (t <= piece.end)]
             if len(inside):

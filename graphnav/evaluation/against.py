@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
@@ -74,9 +75,9 @@ class Foreign(Solution):
         """The trajectory at those times (M,) at which it can be interpolated."""
         return interpolate(self.track, t, max_gap=_MAX_GAP)[0]
 
-    def at(self, t: Array) -> tuple[Array, States, Array]:
+    def at(self, t: ArrayLike) -> tuple[Array, States, Array]:
         """Times, states (NaN where unknown) and covariances (NaN) at those of the times that it covers."""
-        track = self.track_at(t)
+        track = self.track_at(np.sort(np.atleast_1d(np.asarray(t, dtype=float))))
         return track.t, _build_states(self.frame, track), np.full((len(track), DIM, DIM), np.nan)
 
 

@@ -77,7 +77,9 @@ def find_truth(recording: Recording) -> tuple[Trajectory, Array | None] | None:
     if truth is None or (truth.llh is None and truth.xyz is None):
         return None
     lever_arm = None
-    if truth.of != "imu":
+    if not isinstance(truth.of, str):
+        lever_arm = np.array(truth.of)
+    elif truth.of != "imu":
         sensor = getattr(recording, truth.of, None)
         if sensor is None:
             raise RecordingError(

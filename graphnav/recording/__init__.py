@@ -139,7 +139,8 @@ class Truth:
     xyz: Array | None = None  # (M, 2 or 3) m in a local frame of unknown origin and yaw
     v: Array | None = None  # (M, 3) m/s, local ENU, NaN where absent
     rph: Array | None = None  # (M, 3) rad, NaN where absent
-    of: str = "imu"  # the point it refers to: "imu", "gnss", "odometer"
+    # the point it refers to: "imu", "gnss", "odometer", or that many m right, forward, up of the IMU
+    of: str | tuple[float, float, float] = "imu"
     closed_loop_sigma: float | None = None  # m; the end is the start
 
 
@@ -169,6 +170,10 @@ class Recording:
     raw_gnss: RawGnss | None = None  # observations of the antenna that the fixes of `gnss` are of
     sensors: Mapping[str, Series] = field(default_factory=dict)  # other sensors (`graphnav.sensors`), by name
     own: Own = Own()  # as passed to `graphnav.run`
+
+    def __repr__(self) -> str:
+        rows = "".join(f", {name} {len(one.t)}" for name, one in {"imu": self.imu, **self.aiding}.items())
+        return f"Recording({self.name!r}, {self.platform}, {self.duration:.1f} s{rows} rows)"
 
     @cached_property
     def start(self) -> float:

@@ -269,7 +269,7 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
     # truth and keep
     "truth of unknown": (
         toml('file = "truth.csv"', 'file = "truth.csv"\nof = "camera"'),
-        ("key.value", "'truth.of' = 'camera'"),
+        ("key.value", "'truth.of'", "'camera'"),
     ),
     "truth of nobody": (
         both(toml('[odometer]\nfile = "odometer.csv"', ""), toml('"truth.csv"', '"truth.csv"\nof = "odometer"')),
@@ -345,6 +345,7 @@ MENDED: dict[str, tuple[Break, tuple[str, ...], int]] = {
     "partial noise": (toml("gyro_bias_walk = 1e-6\n", ""), ("imu.noise_partly", "gyro_bias_walk"), 100),
     "no sd": (line("gnss.csv", 1, "t,lat,lon,h,a,b,c"), ("gnss_position.sigma_assumed", "3.3, 3.3, 6.6"), 100),
     "one sd": (line("gnss.csv", 1, "t,lat,lon,h,sd_e,b,c"), ("gnss_position.sigma_partly", "sd_e"), 100),
+    "no sd_u": (line("gnss.csv", 1, "t,lat,lon,h,sd_e,sd_n,c"), ("gnss_position.sigma_partly", "sd_u", "twice"), 100),
     "blank sd": (line("gnss.csv", 3, "0.2,50,100,115,1,,1"), ("gnss_position.sigma_blank", "1 of 5"), 100),
     "no sd_v": (line("gnss.csv", 1, "t,lat,lon,h,ve,vn,vu"), ("gnss_velocity.sigma_assumed", "0.2, 0.2, 0.4"), 100),
     "two velocities": (line("gnss.csv", 1, "t,lat,lon,h,ve,vn,c"), ("gnss.velocity_partly", "ve, vn"), 100),

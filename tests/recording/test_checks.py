@@ -191,6 +191,11 @@ BROKEN: dict[str, tuple[Change, str, str]] = {
     "gyro reversed": (imu(gyro=lambda x: -x), "imu.gyro_sign", ""),
     "accelerometer reversed": (imu(accel=lambda x: -x), "imu.force_sign", ""),
     "no overlap": (imu(t=lambda t: t + 1e6), "gnss.clock", "time_offset"),
+    "gyro of a swing clipped": (
+        imu(gyro=lambda x: np.clip(x + 2.0 * np.sin(np.arange(len(x)) / 8.0)[:, None] * [0, 1, 0], -1.5, 1.5)),
+        "imu.saturated",
+        "gyro y ",
+    ),
     "gyro clipped": (imu(gyro=lambda x: np.clip(x, -0.5, 0.5)), "imu.saturated", "gyro z "),
     "stuck": (
         imu(gyro=lambda x: _stick(x), accel=lambda x: _stick(x)),

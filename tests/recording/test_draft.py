@@ -16,9 +16,9 @@ from graphnav.app import cli
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import exp
 from graphnav.recording.checks.overview import inspect
-from graphnav.recording.draft import columns, draft, guesses, motion
+from graphnav.recording.draft import draft, guesses, motion
 from graphnav.recording.draft.agreement import find_level_axes
-from graphnav.recording.formats import read
+from graphnav.recording.formats import columns, read
 from graphnav.recording.formats.schema import parse_axes_letters
 
 DRIVE, _ = oracle.drive(

@@ -172,6 +172,8 @@ def test_a_command_with_a_sensor_withheld(drive, tmp_path, capsys):
     assert cli.run([*command, "--without", "barometer:5-8"]) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert 0 < summary["counts"]["barometer"] < summary["keyframes"] - 3  # that many fall into the span
-    assert "barometer_offset" in json.loads((out / "calibration.json").read_text())
+    found = json.loads((out / "calibration.json").read_text())
+    assert "barometer_offset" in found
+    assert all(len(one["names"]) == len(one["prior_sigma"]) for one in found.values())
     capsys.readouterr()
     assert "barometer" in refuse_command(capsys, "option.withheld", *command, "--without", "barometre")

@@ -84,8 +84,8 @@ def describe_unmeasured(rows: UnmeasuredRows, recording: Recording) -> tuple[str
         longest = max(rows.copies, key=lambda one: one.t_end - one.t_start)
         begin, end = longest.t_start - recording.start, longest.t_end - recording.start
         sentence = (
-            f"gnss: {many} repeat the one before to the last digit, longest from {begin:.1f} to {end:.1f} s: not used, "
-            "since a receiver holds its position where it seems to stand, and a fast logger writes it again"
+            f"gnss: {many} left out as copies of the one before, longest from {begin:.1f} to {end:.1f} "
+            "s: a receiver holds its position where it seems to stand, and a fast logger writes it again"
         )
         notes.append(Note("gnss.copies", sentence))
     if rows.interpolated and gnss is not None:

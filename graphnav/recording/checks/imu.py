@@ -17,6 +17,7 @@ from graphnav.recording.checks.tracks import Track
 _LEAST_FOOT_RATE = 80.0  # Hz; the impact of a step lasts for 20 to 50 ms
 _LONG_GAP = 0.2  # s; over longer ones the motion changes
 _SHAKEN_OVER = 0.02  # s
+_OFTEN = 10  # times that no signal comes to its largest value by itself
 _CHANGED = 3.0  # m/s, of the speed: more than errors of velocities
 
 
@@ -91,10 +92,13 @@ def check_saturation(imu: Imu) -> Iterator[Finding]:
             for sign in (1.0, -1.0):
                 signed = sign * x
                 top = signed.max()
-                if top < smallest or top < 3.0 * signed.std() or top == np.median(signed):
+                if top < smallest or top == np.median(signed):
                     continue
                 runs = [b - a for a, b in find_runs(signed > top - 1e-6 * top) if b - a >= 3]
-                if len(runs) >= 2 or max(runs, default=0) >= 5:
+                seldom = (
+                    top > 3.0 * signed.std()
+                )  # else of a swing; where it ends there again and again, so does the range
+                if (seldom and (len(runs) >= 2 or max(runs, default=0) >= 5)) or len(runs) >= _OFTEN:
                     yield Finding(
                         "warning",
                         f"{what} {'xyz'[axis]} (file axes) is saturated: "

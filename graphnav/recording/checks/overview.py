@@ -248,7 +248,7 @@ def inspect(recording: Recording, screened: Screened | None = None) -> Inspectio
     facts |= {name: describe_series(series) for name, series in recording.sensors.items()}
     findings += check_series(recording)
     if recording.truth is not None:
-        facts["truth"] = {"rows": len(recording.truth.t), "of": recording.truth.of}
+        facts["truth"] = {"rows": len(recording.truth.t), "of": str(recording.truth.of)}
         if recording.truth.closed_loop_sigma:
             facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
         findings += check_truth(recording)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from graphnav.recording.draft.document import Document, format_vector
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import Source
 from graphnav.recording.draft.raw import RawFound, find_raw, write_raw
+from graphnav.recording.draft.references import has_attitude, is_above_sea
 from graphnav.recording.draft.sources import (
     find_logs,
     guess_file_pressure_unit,
@@ -31,9 +31,6 @@ from graphnav.recording.formats.writer import quote
 
 __all__ = ["Draft", "draft"]
 
-# heights by the names of their columns; others are taken as above the ellipsoid
-_ABOVE_SEA = re.compile(r"msl|alt|elev|orth|sea", re.IGNORECASE)
-_ABOVE_ELLIPSOID = re.compile(r"ell|hae|wgs", re.IGNORECASE)
 _SMALL = 0.03  # s; smaller clock offsets are left to the smoother, which estimates them
 _SD = "[3.3, 3.3, 6.6]"  # m, assumed of fixes that state none (graphnav.recording.formats.repair.DEFAULT_SD)
 
@@ -130,6 +127,8 @@ class _Writer:
             self._write_odometer(found["odometer"], course if course is not None and len(course.t) > 50 else None, felt)
         if "barometer" in found:
             self._write_barometer(found["barometer"])
+        if "truth" in found:
+            self._write_truth(found["truth"], found["imu"], "gnss" in found)
         return "\n".join(self.file.lines) + "\n"
 
     def _walks(self, imu: Source, gnss: Source | None) -> bool:
@@ -237,10 +236,18 @@ class _Writer:
                 dropped = (*dropped, "type")
                 self.file.decide(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
         missing = {"sd_e", "sd_n", "sd_u"} - values.keys()
+        if missing == {"sd_u"}:
+            theirs = source.columns.names["sd_e"]
+            self.file.decide(f"sigmas: '{theirs}' is that of each horizontal axis, heights twice as uncertain")
+            missing = set()
         if missing:  # all three or none
             dropped = (*dropped, "sd_e", "sd_n", "sd_u")
+        if source.log is None and has_attitude(source):
+            self.file.decide(
+                f"CHECK: {source.path.name} has attitude: an INS's estimates, whose errors last, not fixes"
+            )
         height = source.columns.names.get("h", "")
-        of_sea = bool(_ABOVE_SEA.search(height)) and not _ABOVE_ELLIPSOID.search(height)
+        of_sea = is_above_sea(height)
         if "geoid" in values:
             pair = f"'{height}' and '{source.columns.names['geoid']}'"
             same = (source.find_unit("h", "length") or "m") == (source.find_unit("geoid", "length") or "m")
@@ -271,9 +278,7 @@ class _Writer:
                 units["speed"] = Guess(stated, "as the column's name says")
             self.file.write_units(units)
             if missing:
-                none = (
-                    "none" if len(missing) == 3 else f"none {'of heights' if missing == {'sd_u'} else 'of all three'}"
-                )
+                none = "none" if len(missing) == 3 else "none of all three"
                 why = (
                     f"CHECK: m, 1-sigma east, north, up; the file states {none}, this is a receiver without corrections"
                 )
@@ -328,6 +333,28 @@ class _Writer:
         assert unit is not None
         self.file.write_units({"t": source.t_unit, "pressure": unit})
 
+    def _write_truth(self, source: Source, imu: Source, fixes: bool) -> None:
+        self.file.begin("truth")
+        self.file.write_file(source, "truth")
+        units = {"t": source.t_unit}
+        if source.radians:
+            units["angle"] = Guess("rad", "lat and lon are all small enough")
+        if source.find_unit("h", "length") == "ft":
+            units["height"] = Guess("ft", "as the column's name says")
+        if stated := source.find_unit("ve", "speed"):
+            units["speed"] = Guess(stated, "as the column's name says")
+        self.file.write_units(units)
+        if is_above_sea(height := source.columns.names["h"]):
+            self.file.decide(f"heights: '{height}' may be above mean sea level; they are used as they are")
+        turns = "roll" in source.values
+        other = "or [x, y, z], m right, forward, up of the IMU"
+        if turns or not fixes:
+            self.file.write_key("of", '"imu"', f'CHECK: its point: "imu", "gnss", "odometer" {other}')
+        else:
+            self.file.write_key("of", '"gnss"', f'CHECK: its point, here the antenna; else "imu" {other}')
+        if (epochs := _find_epoch(imu, source)) is not None and epochs.offset:
+            self.file.write_key("time_offset", f"{epochs.offset:.2f}", f"s; {epochs.words}")
+
 
 def _find_odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> motion.Lag | None:
     """Delay of the wheel speed, by its accelerations against the forward ones of the IMU."""
@@ -339,10 +366,10 @@ def _find_odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> mot
     return motion.find_lag(grid, motion.filter_band(forward[:, 0]), even, motion.filter_band(pull))
 
 
-def _find_epoch(imu: Source, gnss: Source) -> ClockOffset | None:
+def _find_epoch(imu: Source, other: Source) -> ClockOffset | None:
     """Offset between the clocks of two logs, where both are known."""
-    first = [_read_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
-    found = compute_clock_offset(first[0], imu.gps_zero, first[1], gnss.gps_zero)
+    first = [_read_first(source, sensor) for source, sensor in ((imu, "imu"), (other, "gnss"))]
+    found = compute_clock_offset(first[0], imu.gps_zero, first[1], other.gps_zero)
     return found if found is not None and abs(first[1] + found.offset - first[0]) < NEAR else None
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.recording.draft.columns import match_columns
+from graphnav.recording.formats.columns import match_columns
 
 _MARKS = re.compile("[\\s:°º'\u2032\u2019\"\u2033\u201d]+")  # of degrees, minutes and seconds
 _MARKED = re.compile(r"[NSEW°º]", re.IGNORECASE)  # characters that no time of day has

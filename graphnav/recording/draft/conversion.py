@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.plain import Plain, add_words
+from graphnav.recording.formats import columns as matching
+from graphnav.recording.formats.increments import compute_periods
 from graphnav.recording.formats.places import is_in_degrees_and_minutes, is_in_whole_degrees
 from graphnav.recording.formats.table import Table
 
@@ -34,6 +35,26 @@ def convert_small_units(
     words = f"{', '.join(pairs)}, made m or m/s"
     units = {ours: unit for ours, unit in columns.units.items() if ours not in small}
     names = {**names, **{ours: ours for ours in small}}
+    return matching.FileColumns(columns.names, units), names, add_words(plain, words)
+
+
+def divide_increments(
+    columns: matching.FileColumns, names: dict[str, str], values: dict[str, Array], second: float, plain: Plain | None
+) -> tuple[matching.FileColumns, dict[str, str], Plain | None]:
+    """Increments of angle and velocity, known by their names, divided by their sample period; `second` is t's unit.
+
+    `values` are changed.
+    """
+    some = [ours for ours in ("gx", "gy", "gz", "ax", "ay", "az") if matching.is_increment(names.get(ours, ""))]
+    if not some:
+        return columns, names, plain
+    dt, _ = compute_periods(values["t"] * second)
+    for ours in some:
+        values[ours] = values[ours] / dt
+    rates = {"rad": "rad_s", "deg": "deg_s", "m_s": "m_s2", "mps": "m_s2"}
+    units = {ours: rates.get(unit, unit) if ours in some else unit for ours, unit in columns.units.items()}
+    words = f"'{names[some[0]]}' to '{names[some[-1]]}' are increments, divided by their sample period"
+    names = {**names, **{ours: ours for ours in some}}
     return matching.FileColumns(columns.names, units), names, add_words(plain, words)
 
 

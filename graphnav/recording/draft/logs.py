@@ -13,7 +13,6 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import GPS_TO_UNIX, UNIX, WEEK, find_restarts
 from graphnav.recording import Gnss, Imu, Odometer
-from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses
 from graphnav.recording.draft.clocks import read_clock_seconds, read_serial_days
 from graphnav.recording.draft.conversion import (
@@ -22,10 +21,12 @@ from graphnav.recording.draft.conversion import (
     convert_variances,
     convert_whole_degrees,
     convert_whole_velocities,
+    divide_increments,
 )
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.motion import is_course_in_radians
 from graphnav.recording.draft.plain import Plain, add_words, read_plain
+from graphnav.recording.formats import columns as matching
 from graphnav.recording.formats.folder import read_other_log
 from graphnav.recording.formats.places import check_angles, find_places
 from graphnav.recording.formats.registry import Log
@@ -34,39 +35,22 @@ from graphnav.recording.formats.schema import WHEELS
 from graphnav.recording.formats.table import Table, read_column_names, read_first_rows, read_table
 from graphnav.sensors.tables import ANGLE, TIME_UNITS
 
+_PLACE = ["t", "lat", "lon", "h"]
+_VELOCITY = ["ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course"]
 WANTED = {
     "imu": ("t", "gx", "gy", "gz", "ax", "ay", "az"),
     "gyro": ("t", "gx", "gy", "gz"),
     "accel": ("t", "ax", "ay", "az"),
-    "gnss": (
-        "t",
-        "lat",
-        "lon",
-        "h",
-        "sd_e",
-        "sd_n",
-        "sd_u",
-        "ve",
-        "vn",
-        "vu",
-        "vd",
-        "sd_ve",
-        "sd_vn",
-        "sd_vu",
-        "speed",
-        "course",
-        "type",
-        "satellites",
-        "resid_rms_m",
-        "geoid",
-    ),
+    "gnss": (*_PLACE, "sd_e", "sd_n", "sd_u", *_VELOCITY, "type", "satellites", "resid_rms_m", "geoid"),
+    "truth": (*_PLACE, *_VELOCITY[:4], *matching.ATTITUDE),
     "odometer": ("t", "speed", *WHEELS),
     "barometer": ("t", "pressure"),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
 CALLED = "t; gx gy gz ax ay az; lat lon h; speed"  # names that all sensors' columns can have
+PLACED = ("gnss", "truth")  # sensors with positions
 _PAUSES = 1000.0  # ratio of a log's duration to that of all its rows together, at most
-_NEEDED = {"gnss": 4, "odometer": 2}  # number of these that a row must have
+_NEEDED = {"gnss": 4, "truth": 4, "odometer": 2}  # number of these that a row must have
 
 
 @dataclass(eq=False)
@@ -139,6 +123,44 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     log = read_other_log(path, topics)
     if log is not None:
         return {s: Source(path, log=log) for s in ("imu", "gnss", "odometer") if getattr(log, s) is not None}
+    header, columns, plain, wheels = read_header(path)
+    sensor = columns.sensor
+    assert sensor is not None
+    roles = [sensor]
+    if sensor == "imu" and {"lat", "lon"} <= columns.names.keys():
+        roles.append("gnss")
+    elif sensor == "imu" and "speed" in columns.names:
+        roles.append("odometer")
+    of = dict.fromkeys(roles, columns)
+    if wheels := [name for name in wheels if _read_numbers(path, name, plain)]:
+        own = matching.match_columns([columns.names["t"], *wheels])
+        clock = {"t": columns.units["t"]} if "t" in columns.units else {}
+        of["odometer"] = matching.FileColumns({**own.names, "t": columns.names["t"]}, {**own.units, **clock})
+    found: dict[str, Source] = {}
+    for role, some in of.items():  # whose clock is that of the first, whose rows are the most
+        found[role] = read_sensor(path, some, role, plain, found[sensor].t_unit if found else None)
+    if sensor == "imu" and not has_gravity(found["imu"]):
+        found["imu"], of["imu"] = _find_gravity(path, header, columns, plain, found["imu"])
+    taken = {
+        theirs
+        for role, source in found.items()
+        for ours, theirs in of[role].names.items()
+        if ours in source.values or ours in "xyz"
+    } | {columns.names.get("week")}
+    found[sensor].unused = tuple(name for name in header if name and name not in taken)
+    for role, source in found.items():
+        source.second = _find_second(header, columns, WANTED[role][1:3] if role == "gnss" else WANTED[role][1:])
+    return found
+
+
+def read_header(path: Path) -> tuple[list[str], matching.FileColumns, Plain | None, list[str]]:
+    """The names of a table, those of a sensor's columns, the table if it is no plain CSV file, and those of wheels.
+
+    Raises
+    ------
+    NoSensorError
+        If it holds no known sensor.
+    """
     plain = read_plain(path) if path.is_file() else None
     try:
         header = read_column_names(path) if plain is None else list(plain.columns)
@@ -160,31 +182,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     elif stamps := plain.dated or (plain.daily if columns.names["t"] == plain.daily else None):
         units = {ours: unit for ours, unit in columns.units.items() if ours != "t"}
         columns = matching.FileColumns({**columns.names, "t": stamps}, units)
-    roles = [sensor]
-    if sensor == "imu" and {"lat", "lon"} <= columns.names.keys():
-        roles.append("gnss")
-    elif sensor == "imu" and "speed" in columns.names:
-        roles.append("odometer")
-    of = dict.fromkeys(roles, columns)
-    if wheels := [name for name in wheels if _read_numbers(path, name, plain)]:
-        own = matching.match_columns([columns.names["t"], *wheels])
-        clock = {"t": columns.units["t"]} if "t" in columns.units else {}
-        of["odometer"] = matching.FileColumns({**own.names, "t": columns.names["t"]}, {**own.units, **clock})
-    found: dict[str, Source] = {}
-    for role, some in of.items():  # whose clock is that of the first, whose rows are the most
-        found[role] = _read_sensor(path, some, role, plain, found[sensor].t_unit if found else None)
-    if sensor == "imu" and not has_gravity(found["imu"]):
-        found["imu"], of["imu"] = _find_gravity(path, header, columns, plain, found["imu"])
-    taken = {
-        theirs
-        for role, source in found.items()
-        for ours, theirs in of[role].names.items()
-        if ours in source.values or ours in "xyz"
-    } | {columns.names.get("week")}
-    found[sensor].unused = tuple(name for name in header if name and name not in taken)
-    for role, source in found.items():
-        source.second = _find_second(header, columns, WANTED[role][1:3] if role == "gnss" else WANTED[role][1:])
-    return found
+    return header, columns, plain, wheels
 
 
 def has_gravity(source: Source) -> bool:
@@ -212,13 +210,13 @@ def _find_gravity(
                 if ours not in axes or ours in other.units
             },
         )
-        source = _read_sensor(path, both, "imu", plain)
+        source = read_sensor(path, both, "imu", plain)
         if has_gravity(source):
             return source, both
     pull = matching.find_gravity(rest)
     if len(pull) == len(axes):
         sources = [
-            _read_sensor(path, matching.FileColumns({**columns.names, ours: theirs}, columns.units), "imu", plain)
+            read_sensor(path, matching.FileColumns({**columns.names, ours: theirs}, columns.units), "imu", plain)
             for ours, theirs in zip(axes, pull, strict=True)
         ]
         values = {ours: bare.values[ours] + one.values[ours] for ours, one in zip(axes, sources, strict=True)}
@@ -300,13 +298,13 @@ def _read_numbers(path: Path, name: str, plain: Plain | None) -> bool:
         return False
 
 
-def _read_sensor(
+def read_sensor(
     path: Path, columns: matching.FileColumns, role: str, plain: Plain | None, clock: Guess | None = None
 ) -> Source:
     """The columns of one sensor: rows complete in what it needs, in order of time; `clock` is their unit, if known."""
     wanted = WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
-    if role in ("imu", "gnss") and "week" in columns.names:
+    if role in ("imu", *PLACED) and "week" in columns.names:
         names["week"] = columns.names["week"]
     for extra in ("type", "satellites", "resid_rms_m", "geoid", "week"):
         if extra in names and not _read_numbers(path, names[extra], plain):
@@ -316,9 +314,14 @@ def _read_sensor(
     else:
         own = {ours: plain.columns[theirs] for ours, theirs in names.items()}
         table = Table(path, own, names, np.arange(len(own["t"])))
+    for ours in names:
+        if role != "odometer" and len(bad := np.flatnonzero(np.isinf(table[ours]))):
+            raise RecordingError(
+                f"{table.describe_place(bad[0], ours)}: the value is infinite; leave it blank", key="table.not_finite"
+            )
     needed = [n for n in wanted[: _NEEDED.get(role, len(wanted))] if n in names]
     whole = np.asarray(np.isfinite(table.stack(*needed)).all(-1))
-    if role == "gnss":
+    if role in PLACED:
         table, known = blank_unknown(table)  # as it will be read
         before = table
         whole &= known
@@ -347,7 +350,7 @@ def _read_sensor(
     elif (seconds := read_serial_days(values["t"])) is not None:
         words = f"days of '{names['t']}', as a spreadsheet counts them, as Unix time in s; CHECK: taken as UTC"
         values["t"], plain = seconds, Plain({}, words)
-    inertial = role not in ("gnss", "odometer", "barometer")
+    inertial = role not in (*PLACED, "odometer", "barometer")
     unit = clock or guesses.guess_time_unit(values["t"], matching.find_stated_unit(columns, "t", "t"), inertial)
     if (later := find_restarts(values["t"], TIME_UNITS[str(unit.value)])) is not None:  # as it will be read
         values["t"] = values["t"] + later
@@ -370,6 +373,8 @@ def _read_sensor(
         if counted:
             plain = convert_whole_velocities(names, values, values["t"] * TIME_UNITS[str(unit.value)], plain)
     columns, names, plain = convert_small_units(columns, names, values, plain)
+    if inertial:
+        columns, names, plain = divide_increments(columns, names, values, TIME_UNITS[str(unit.value)], plain)
     step = np.diff(values["t"])
     if step.sum() > _PAUSES * len(step) * np.median(step):
         k = int(np.argmax(step))

@@ -16,7 +16,8 @@ from graphnav.core.files import is_blank, open_file, parse_number, read_bytes
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import DAY
 from graphnav.recording.draft.angles import read_angles
-from graphnav.recording.draft.columns import NAMED_UNITS, match_columns, split_unit
+from graphnav.recording.draft.cells import MARKED, take_units_off, write_plainly
+from graphnav.recording.formats.columns import NAMED_UNITS, match_columns, split_unit
 from graphnav.recording.formats.text import NumberedLines
 
 _START = 1 << 16  # bytes that contain the header
@@ -31,11 +32,6 @@ _YEAR_FIRST = re.compile(
 )  # 2025-07-08, 20250708T
 _SLASHES = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})(.*)")  # 07/08/2025, where one number may identify the month
 _TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
-_MARKED = re.compile(r"[+-]?\d[\d.,'\u2019\u00a0\u202f ]*(?:[eE][+-]?\d+)?")  # a number in some country
-_SPACED = re.compile(r"(?<=\d)['\u2019\u00a0\u202f ](?=\d{3}(?!\d))")  # marks that are only ever between thousands
-_GROUPED = {
-    mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+(?:\{other}\d+)?") for mark, other in (",.", ".,")
-}
 _NANOSECONDS = re.compile(r"(.*?)n(?:ano)?_?sec(?:ond)?s?", re.IGNORECASE)
 
 
@@ -121,8 +117,10 @@ def read_plain(path: Path) -> Plain | None:
         )
     cells = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
     if layout.mark != "," or '"' in text:  # else no number has a comma in it
-        cells, style = _write_plainly(cells, layout.mark)
+        cells, style = write_plainly(cells, layout.mark)
         done += style
+    cells, stated = take_units_off(cells)
+    done += stated
     columns = {name: x for name, some in cells.items() if (x := _parse_column(some)) is not None}
     done += [*_add_nanoseconds(columns), *read_angles(cells, columns)]
     dated, daily, more = _parse_times(cells, columns, layout.above)
@@ -166,7 +164,7 @@ def _read_values(line: str, mark: str | None) -> tuple[float, int]:
 def _is_value(cell: str) -> bool:
     return (
         _parse_column([cell]) is not None
-        or _MARKED.fullmatch(cell) is not None
+        or MARKED.fullmatch(cell) is not None
         or _parse_clock(cell) is not None
         or bool(_parse_date(cell) or _SLASHES.fullmatch(cell))
     )
@@ -240,34 +238,6 @@ def _are_units(cells: Sequence[str]) -> bool:
     """Whether a line under the names holds units."""
     spelt = [split_unit(f"x [{cell.strip('[]()')}]")[1] for cell in cells if cell.strip("[]()-")]
     return sum(unit in NAMED_UNITS for unit in spelt) > 0.5 * len(spelt)
-
-
-def _write_plainly(cells: dict[str, list[str]], mark: str | None) -> tuple[dict[str, list[str]], list[str]]:
-    """Numbers with decimal commas or marks between thousands written with a decimal point alone, and notes.
-
-    A table has one decimal mark throughout: that of numbers which are no grouping by three; where there are none, the
-    point if commas separate the fields.
-    """
-    marked = [cell for some in cells.values() for cell in some if _MARKED.fullmatch(cell)]
-    if not any("," in cell or cell.count(".") > 1 or _SPACED.search(cell) for cell in marked):
-        return cells, []
-    bare = [_SPACED.sub("", cell) for cell in marked]
-    commas, points = (
-        sum(cell.count(x) == 1 and cell.rfind(x) > cell.rfind(y) and not _GROUPED[x].fullmatch(cell) for cell in bare)
-        for x, y in (",.", ".,")
-    )
-    between = "." if commas > points or (commas == points and mark != ",") else ","
-    grouped = bare != marked or any(_GROUPED[between].fullmatch(cell) for cell in bare)
-
-    def rewrite(cell: str) -> str:
-        if not _MARKED.fullmatch(cell):
-            return cell
-        cell = _SPACED.sub("", cell)
-        return (cell.replace(between, "") if _GROUPED[between].fullmatch(cell) else cell).replace(",", ".")
-
-    notes = ["decimal commas"] if between == "." else []
-    notes += ["marks between thousands"] if grouped else []
-    return {name: [rewrite(cell) for cell in some] for name, some in cells.items()}, notes
 
 
 def _add_nanoseconds(columns: dict[str, Array]) -> list[str]:
@@ -365,7 +335,8 @@ def _parse_date(text: str) -> datetime | None:
         month = month if month.isdigit() else str(_MONTHS.index(month.lower()) + 1)
         start = datetime(int(year), int(month), int(day))
         rest = rest.strip(" T").replace(",", ".")
-        if (seconds := _parse_clock(rest) if rest else 0.0) is not None:
+        if (seconds := _parse_clock(rest.removesuffix("Z")) if rest else 0.0) is not None:
+            start = start.replace(tzinfo=UTC) if rest.endswith("Z") else start
             return start + timedelta(seconds=seconds)
         return datetime.combine(start, time.fromisoformat(rest))
     except ValueError:

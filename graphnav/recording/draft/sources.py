@@ -13,12 +13,13 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import DAY, NEAR, UNIX, gps_to_utc
-from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import CALLED, WANTED, NoSensorError, Source, has_gravity, read_log
 from graphnav.recording.draft.parts import join_parts
 from graphnav.recording.draft.raw import RawFiles, separate_raw, tell_kind
+from graphnav.recording.draft.references import separate_reference
+from graphnav.recording.formats import columns as matching
 from graphnav.recording.formats import list_formats
 from graphnav.recording.formats.schema import SPEED
 from graphnav.sensors.tables import ANGLE
@@ -75,9 +76,12 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         left.append(f"{others}: no logs of a kind that is known")
     if nothing:
         left.append(f"left out: {', '.join(nothing)}: no sensor is recognised in the columns; names that are: {CALLED}")
+    every["gnss"], reference = separate_reference(every.get("gnss", []))
     sensors = {
         sensor: chosen for sensor, some in every.items() if (chosen := _choose_source(sensor, some, left)) is not None
     }
+    if reference is not None:
+        sensors["truth"] = reference
     if "imu" not in sensors and "gyro" in sensors:
         if "accel" not in sensors and "accel" in every and "gravity" in sensors:
             sensors["accel"] = _add_gravity(every["accel"][0], sensors["gravity"], left)
@@ -112,7 +116,9 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         left.append(f"left out: {air.path.name}: its pressures are not those of air in any unit")
         del sensors["barometer"]
     return LogsFound(
-        {name: sensors[name] for name in ("imu", "gnss", "odometer", "barometer") if name in sensors}, left, raw
+        {name: sensors[name] for name in ("imu", "gnss", "odometer", "barometer", "truth") if name in sensors},
+        left,
+        raw,
     )
 
 

@@ -12,6 +12,7 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Truth
 from graphnav.recording.formats import schema
+from graphnav.recording.formats.increments import compute_periods, note_gaps
 from graphnav.recording.formats.places import convert_geodetic
 from graphnav.recording.formats.pulses import count_pulses
 from graphnav.recording.formats.repair import (
@@ -30,14 +31,22 @@ from graphnav.sensors import Sensor, Series
 from graphnav.sensors.tables import ANGLE
 
 _ROWS_AT_ONCE = 1 << 16  # rows at once
+_FASTEST = 300.0  # m/s; larger ones stand for none (999)
 _SD_V = ("sd_ve", "sd_vn", "sd_vu")
 
 
 def build_imu(d: schema.ImuTable, rows: Table, remarks: Notes) -> Imu:
     """Samples in body axes RFU, rad/s and m/s^2, with the stated noise figures, else a consumer IMU's."""
     R_bs = d.R_bs
-    gyro = _take_in_body(rows, ("gx", "gy", "gz"), schema.RATE_UNITS[d.units.gyro], R_bs)
-    accel = _take_in_body(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
+    turned, pushed = d.units.gyro in schema.ANGLE_STEPS, d.units.accel in schema.VELOCITY_STEPS
+    gyro = _take_in_body(rows, ("gx", "gy", "gz"), (schema.RATE_UNITS | schema.ANGLE_STEPS)[d.units.gyro], R_bs)
+    accel = _take_in_body(rows, ("ax", "ay", "az"), (schema.FORCE | schema.VELOCITY_STEPS)[d.units.accel], R_bs)
+    if turned or pushed:
+        dt, gap = compute_periods(rows["t"])
+        note_gaps(gap, remarks)
+        for steps, some in ((turned, gyro), (pushed, accel)):
+            if steps:
+                some /= dt[:, None]
     stated = d.figures
     noise = replace(ImuNoise(), **stated)
     missing = [key for key in schema.STATED_FIGURES if key not in stated]
@@ -100,6 +109,14 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Notes) -> Gnss:
     if len(there) == 3:
         v = rows.stack("ve", "vn", "vu") * scale
         absent = np.isnan(v).any(-1)
+        beyond = ~absent & (np.linalg.norm(v, axis=1) > _FASTEST)
+        if 0 < beyond.sum() < 0.5 * len(v):  # else in another unit
+            remarks.add(
+                "gnss.velocity_beyond",
+                f"{format_count(beyond.sum(), 'GNSS velocity', 'GNSS velocities')} of more than {_FASTEST:g} m/s, "
+                f"which no land vehicle reaches, left out (first at t = {rows['t'][beyond][0]:.3f} s)",
+            )
+            absent |= beyond
         v[absent] = np.nan
         sd_v = choose_sigmas(rows, _SD_V, d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
         absent |= (sd_v > VAGUEST_V).any(-1)
@@ -219,6 +236,8 @@ def build_truth(d: schema.TruthTable, rows: Table, remarks: Notes) -> Truth:
         xyz = rows.stack("x", "y", "z") if "z" in rows else rows.stack("x", "y")
     else:
         llh, rows = convert_geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "truth", remarks)
+    if "vd" in rows and "vu" not in rows:
+        rows = rows.with_column("vu", -rows["vd"])
     v = _read_part(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
     rph = _read_part(rows, ("roll", "pitch", "heading"), ANGLE[d.units.angle or "deg"])
     return Truth(rows["t"], llh, xyz, v, rph, d.of)

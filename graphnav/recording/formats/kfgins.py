@@ -27,6 +27,7 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK
 from graphnav.recording import Gnss, Imu, Odometer, Truth
+from graphnav.recording.formats.increments import compute_periods, note_gaps
 from graphnav.recording.formats.kfgins_configuration import (
     find_file,
     mention_unused,
@@ -40,7 +41,6 @@ from graphnav.recording.formats.schema import parse_axes_letters
 from graphnav.recording.formats.text import parse_table, split_lines
 from graphnav.recording.formats.trajectories import read_trajectory
 
-_GAP_PERIODS = 1.5  # a step of this many periods is a gap: the increments after it are still of one period
 _LARGEST = 0.3  # rad or m/s: larger than any increment of a sample
 _IMU_KEYS, _GNSS_KEYS = ("imupath", "imufile"), ("gnsspath", "gnssfile")
 
@@ -245,21 +245,16 @@ def _read_imu(path: Path, remarks: Notes) -> tuple[Imu, Array | None]:
             f"{path}: increments of more than 2 rad a sample; are these rates, or not increments at all?",
             key="imu.increments_large",
         )
-    period = float(np.median(step))
-    gap = step > _GAP_PERIODS * period
-    dt = np.concatenate([[period], np.where(gap, period, step)])[:, None]
-    if gap.any():
-        remarks.add(
-            "imu.increments_after_gap",
-            f"{format_count(gap.sum(), 'gap')} in the IMU: the increments after each are taken as those of one period",
-        )
+    dt, gap = compute_periods(t)
+    note_gaps(gap, remarks)
     R_bs = parse_axes_letters("FRD")
     remarks.add(
         "imu.read_as",
         f"IMU: angle (rad) and velocity (m/s) increments in forward-right-down, divided by their sample period "
-        f"({period:g} s)",
+        f"({np.median(step):g} s)",
     )
-    imu = Imu(t.copy(), table[:, 1:4] / dt @ R_bs.T, table[:, 4:7] / dt @ R_bs.T, R_bs=R_bs, noise_assumed=True)
+    rates = table[:, 1:7] / dt[:, None]
+    imu = Imu(t.copy(), rates[:, :3] @ R_bs.T, rates[:, 3:] @ R_bs.T, R_bs=R_bs, noise_assumed=True)
     return imu, table[:, 7].copy() if table.shape[1] == 8 else None
 
 

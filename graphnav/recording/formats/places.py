@@ -70,6 +70,8 @@ def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, r
     if len(beyond):
         k = beyond[0]
         hint = "; is it in millimetres?" if abs(h[k]) > _HIGHEST else ""
+        if 2 * len(beyond) < len(h):  # the others are sound
+            hint = "; leave the height blank where there is none"
         raise RecordingError(
             f"{rows.describe_place(k, 'h')}: {h[k]:g} m is not the height of a drive{hint}", key="table.height"
         )

@@ -23,6 +23,7 @@ _LEAST_SIGMA = 1e-9  # m, m/s; a smaller sigma is not meant as one
 _SET_BACK_PERIODS = 10.0  # periods; rows that overtake each other are closer
 _PAUSE = 1.0  # s; longer steps of an IMU are gaps
 _BURST = 0.3  # ratio of median to mean step below which rows come in bursts
+_ROUNDED_AWAY = 0.05  # share of the stamps that repeat the one before, where a rounding makes them
 _REPEATED = 0.6  # share of rows with the stamp of the previous row above which the log is refused
 
 
@@ -62,7 +63,11 @@ def select_usable_rows(
         if len(bad) and sensor == "odometer":  # of which single readings can be missing
             rows = rows.with_column(name, np.where(np.isinf(rows[name]), np.nan, rows[name]))
         elif len(bad):
-            what = f"{stamps[bad[0]]:.16g} is no time in {unit}" if name == "t" else "the value is infinite"
+            what = (
+                f"{stamps[bad[0]]:.16g} is no time in {unit}"
+                if name == "t"
+                else "the value is infinite; leave it blank"
+            )
             dates = [other for other, scale in TIME_UNITS.items() if UNIX < stamps[bad[0]] * scale < 3.0 * UNIX]
             hint = f'; say units = {{ t = "{dates[0]}" }}: it is then a date' if name == "t" and dates else ""
             raise RecordingError(f"{rows.describe_place(bad[0], name)}: {what}{hint}", key="table.not_finite")
@@ -112,7 +117,7 @@ def select_usable_rows(
         remarks.add(
             f"{sensor}.rows_repeated",
             f"{format_row_count(repeated, label)} with the time of the row before dropped "
-            f"(first at t = {t[repeated][0]:.3f} s)",
+            f"(first at t = {t[repeated][0]:.3f} s){_tell_rounding(stamps, repeated)}",
         )
         rows = rows.take(~repeated)
     if sensor == "imu":
@@ -122,6 +127,15 @@ def select_usable_rows(
         held = format_row_count(~new, "GNSS")
         remarks.add("gnss.held", f"{held} with the fix of the row before left out, {len(rows)} kept")
     return rows
+
+
+def _tell_rounding(stamps: Array, repeated: NDArray[np.bool_]) -> str:
+    """'; ...' where stamps (N,), in the file's unit, repeat because they went through single precision."""
+    known = stamps[np.isfinite(stamps)]
+    step = np.spacing(np.float32(np.abs(known).max())) if len(known) else 0.0
+    if repeated.mean() < _ROUNDED_AWAY or not np.array_equal(known, known.astype(np.float32)):
+        return ""
+    return f": stamps are rounded to {step:g}, as single-precision numbers are; write them with double precision"
 
 
 def find_repeated(path: Path, t: Array) -> NDArray[np.bool_]:
@@ -226,6 +240,11 @@ def choose_sigmas(
     """
     of = what.lower().replace(" ", "_")  # gnss_position
     there = [name for name in names if name in rows]
+    if there == ["sd_e", "sd_n"]:  # as of phones: heights are twice as uncertain
+        up = np.hypot(rows["sd_e"], rows["sd_n"]) * np.sqrt(2.0)
+        rows, there = rows.with_column("sd_u", up if stated is None else np.full(len(rows), stated[2])), list(names)
+        taken = "twice the horizontal ones are" if stated is None else "that of sd in [gnss] is"
+        remarks.add(f"{of}.sigma_partly", f"{what} sigmas of heights: no column sd_u: {taken} taken")
     fallback = np.array(stated or default)
     assumed = f"{what} sigmas of {default[0]:g}, {default[1]:g}, {default[2]:g} (east, north, up) are assumed"
     if len(there) < 3:

@@ -19,7 +19,7 @@ from pydantic import (
 )
 from pydantic.types import Strict
 
-from graphnav.core.complaints import describe_invalid, read_toml, suggest_nearest
+from graphnav.core.complaints import describe_invalid, read_toml, shorten, suggest_nearest
 from graphnav.core.earth import MG, STANDARD_GRAVITY
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
@@ -64,11 +64,22 @@ _LETTERS = {"R": (1, 0, 0), "L": (-1, 0, 0), "F": (0, 1, 0), "B": (0, -1, 0), "U
 
 
 class ImuUnits(TomlTable):
-    """Units of imu.csv."""
+    """Units of an IMU's rates and forces."""
 
     t: TimeUnit = "s"
     gyro: Literal["rad/s", "deg/s", "mdeg/s"] = "rad/s"
     accel: Literal["m/s2", "g", "mg", "ft/s2", "-m/s2", "-g"] = "m/s2"
+
+
+# of increments over a sample, in files
+ANGLE_STEPS, VELOCITY_STEPS = {"rad": 1.0, "deg": np.pi / 180.0}, {"m/s": 1.0}
+
+
+class ImuFileUnits(ImuUnits):
+    """Units of imu.csv, which may hold increments of angle and velocity over each sample."""
+
+    gyro: Literal["rad/s", "deg/s", "mdeg/s", "rad", "deg"] = "rad/s"  # type: ignore[assignment]
+    accel: Literal["m/s2", "g", "mg", "ft/s2", "-m/s2", "-g", "m/s"] = "m/s2"  # type: ignore[assignment]
 
 
 class GnssUnits(TomlTable):
@@ -161,6 +172,8 @@ class ImuTable(ImuDescription, SensorTable):
     """[imu]"""
 
     required = ("t", "gx", "gy", "gz", "ax", "ay", "az")
+
+    units: ImuFileUnits = ImuFileUnits()
 
 
 GEOID = "geoid"  # added to h, only where `columns` names it: in other files h may be above the ellipsoid already
@@ -273,15 +286,27 @@ class OdometerTable(SensorTable):
         return ("speed",)
 
 
+def _point(value: Any) -> Any:
+    if value in ("imu", "gnss", "odometer"):
+        return value
+    try:
+        return check_three_numbers(value)
+    except ValueError:
+        words = 'must be "imu", "gnss", "odometer" or three numbers in brackets'
+        raise ValueError(f"{words}, not {shorten(value)}") from None
+
+
 class TruthTable(SensorTable):
     """[truth]"""
 
     required = ("t",)
-    optional = ("lat", "lon", "h", "x", "y", "z", "ve", "vn", "vu", "roll", "pitch", "heading")
+    optional = ("lat", "lon", "h", "x", "y", "z", "ve", "vn", "vu", "vd", "roll", "pitch", "heading")
 
     file: str | None = Field(None, min_length=1)  # type: ignore[assignment]
     units: GnssUnits = GnssUnits()
-    of: Literal["imu", "gnss", "odometer"] = "imu"
+    of: Annotated[str | tuple[float, float, float], BeforeValidator(_point)] = Field(
+        "imu", description="its point: that of a sensor, or m right, forward, up of the IMU"
+    )
     frame: Literal["geodetic", "local"] = "geodetic"
     closed_loop_sigma: Positive | None = Field(None, description="m, from the start to the end")
 
@@ -319,7 +344,7 @@ class RecordingFile(TomlTable):
     @model_validator(mode="after")
     def _truth_of_a_sensor(self) -> RecordingFile:
         of = self.truth.of if self.truth else "imu"
-        if getattr(self, of) is None and not (of == "gnss" and self.raw_gnss is not None):
+        if isinstance(of, str) and getattr(self, of) is None and not (of == "gnss" and self.raw_gnss is not None):
             raise ValueError(f"truth.of = '{of}', but there is no [{of}] table whose lever arm would apply")
         return self
 

@@ -21,8 +21,9 @@ from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import drop_cut_line, read_decimals
 
 _BLANK_CELL = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that is not empty
-# to the end of the line from #, unless it begins a cell (#N/A); whole lines from %, which units hold as well
-_COMMENT = re.compile(r"(?m)(^|[^,\s])[ \t]*#.*|^[ \t]*%.*")
+# to the end of the line from #, unless it begins a cell (#N/A) or is in a NaN of Windows (1.#IND); whole lines from %,
+# which units hold as well
+_COMMENT = re.compile(r"(?m)(^|[^,\s])(?<!1\.)[ \t]*#.*|^[ \t]*%.*")
 _EMPTY = "is empty, or holds comments (#) alone; copy the log again, or leave this file out"
 _MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # separators, in the order of their tests
 
@@ -175,6 +176,12 @@ def _open(path: Path) -> IO[str]:
 def _open_bytes(path: Path) -> IO[bytes]:
     if not exists(path):
         other = path.with_suffix("") if path.suffix == ".gz" else path.with_name(path.name + ".gz")
+        like = (
+            (one for one in path.parent.iterdir() if one.name.lower() == path.name.lower())
+            if exists(path.parent)
+            else ()
+        )
+        other = next(iter(like), other)
         hint = f"; there is {other.name}" if exists(other) else ""
         raise RecordingError(f"{path}: no such file{hint}", key="file.missing")
     if path.is_dir():
@@ -294,14 +301,19 @@ def _list_lines(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
 
 def _suggest_cause(cell: str, cells: list[str], header: list[str], use: list[int]) -> str:
     """The likely meaning of a cell that is not a number, and what to do."""
-    if [one.strip('"') for one in cells] == header:
+    bare = [one.strip('"') for one in cells]
+    if bare == header:
         return "; the header is there again: cut the file in two there, or take the line out"
+    if sorted(bare) == sorted(header):
+        return "; the header is there again, in another order: cut the file in two there"
     if re.fullmatch(r"(\d+-\d+-\d+[T ])?\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?Z?", cell):
         return "; it is a time of day: write seconds, or let graphnav init do it"
     if re.match(r"\d+[-/.]\d+[-/.]\d+\b", cell):
         return "; it is a date: write seconds, or year-month-day, of which graphnav init makes them"
     if not any(_is_number(cells[k].strip('"')) for k in use):
-        return "; if the line holds units, take it out"
+        return "; if the line holds units, take it out, or let graphnav init do it"
+    if re.fullmatch(r"[-+]?\d+(\.\d*)?([eE][-+]?\d+)?\s*[A-Za-z%°][\w/²^]*", cell):
+        return "; write the number alone, and its unit in units, or let graphnav init do it"
     return ""
 
 

@@ -4,6 +4,7 @@
 graphnav CSV       a header line with t, lat, lon, h (deg, m) or x, y[, z] (m, a local frame), and any of
                    ve vn vu, roll pitch heading, sd_e ... sd_heading, bgx ... baz; a unit may be part of a
                    name (t_s, lat_deg, h_m, ve_mps); vd is turned into vu
+other CSV          the same under other names, units and separators (`graphnav.recording.draft.references`)
 KF-GINS .nav       11 columns: GNSS week, seconds of week, lat, lon (deg), height (m), velocity north, east,
                    down (m/s), roll, pitch, yaw (deg) of a forward-right-down body to north-east-down in ZYX
                    order (the project's README, section 2), which are our roll, pitch and heading
@@ -28,8 +29,10 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK
 from graphnav.core.trajectory import Trajectory
+from graphnav.recording.formats.columns import match_attitude, match_columns
 from graphnav.recording.formats.repair import LATEST
 from graphnav.recording.formats.rtklib_solution import parse_solution
+from graphnav.recording.formats.schema import HEIGHT, SPEED
 from graphnav.recording.formats.text import parse_table, split_lines
 
 _RTKLIB = re.compile(r"program\s*:|\bQ\b.*\bns\b")  # of its header, other programs have comments from % as well
@@ -40,6 +43,7 @@ _COLUMN_UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": 
 )
 _COLUMN_UNITS |= dict.fromkeys(("roll", "pitch", "heading"), "deg")
 _SIGMA_COLUMNS = "sd_e sd_n sd_u sd_ve sd_vn sd_vu sd_roll sd_pitch sd_heading"
+_MOTION = {"ve", "vn", "vu", "vd", "roll", "pitch", "heading"}
 # columns that are read; others may hold anything
 _KNOWN_COLUMNS = {*_COLUMN_UNITS, *_SIGMA_COLUMNS.split(), *["bgx", "bgy", "bgz", "bax", "bay", "baz"]}
 
@@ -167,10 +171,10 @@ def _read_csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
                for k, name in enumerate(names)}  # fmt: skip
     local = "lat" not in columns and {"x", "y"} <= columns.keys()
     needed = ("t", "x", "y") if local else ("t", "lat", "lon", "h")
-    if missing := [name for name in needed if name not in columns]:
-        raise RecordingError(
-            f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)[:300]}", key="table.column"
-        )
+    theirs = match_columns(names).names | match_attitude(names).names
+    other = theirs.keys() & _MOTION - columns.keys() and not columns.keys() & set(_SIGMA_COLUMNS.split())
+    if any(name not in columns for name in needed) or (other and not local):
+        return _read_reference(path)
     wanted = {names[k] for name, k in columns.items() if name in _KNOWN_COLUMNS}
     table = parse_table(path, rows, names, ",", wanted)
 
@@ -193,6 +197,30 @@ def _read_csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
         sd_v=take("sd_ve", "sd_vn", "sd_vu"), sd_rph=take("sd_roll", "sd_pitch", "sd_heading", scale=_DEG),
         gyro_bias=take("bgx", "bgy", "bgz"), accel_bias=take("bax", "bay", "baz"),
         local=local,
+    )  # fmt: skip
+
+
+def _read_reference(path: Path) -> Trajectory:
+    """A table with other columns, as `graphnav init` reads it."""
+    from graphnav.recording.draft.references import describe, read_reference
+
+    source = read_reference(path)
+    missing = np.full(len(source), np.nan)
+
+    def take(*wanted: str, scale: float) -> Array | None:
+        there = [name for name in wanted if name in source.values]
+        return np.column_stack([source.values.get(name, missing) * scale for name in wanted]) if there else None
+
+    height = HEIGHT[source.find_unit("h", "length") or "m"]
+    v = take("ve", "vn", "vu", scale=SPEED[source.find_unit("ve", "speed") or "m/s"])
+    if v is not None and "vd" in source.values and "vu" not in source.values:
+        v[:, 2] = -source.values["vd"] * SPEED[source.find_unit("vd", "speed") or "m/s"]
+    notes = Notes()
+    notes.add("trajectory.columns", f"{path.name}: {describe(source)}")
+    rows = [(0, "")] * len(source)  # in order, and whole
+    return _build(
+        path, rows, source.t, source.llh * [1.0, 1.0, height], notes, v=v,
+        rph=take("roll", "pitch", "heading", scale=_DEG), gps_zero=source.gps_zero,
     )  # fmt: skip
 
 

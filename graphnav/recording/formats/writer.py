@@ -226,7 +226,7 @@ def _write_toml(log: Log) -> str:
         lines += (
             ['frame = "local"                # metres, of unknown origin and yaw'] if log.truth.xyz is not None else []
         )
-        lines += [f'of = "{log.truth.of}"']
+        lines += [f"of = {_format_toml(log.truth.of)}"]
     return "\n".join(lines) + "\n"
 
 

@@ -205,8 +205,9 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         np.sqrt(turn, out=turn)
         quiet = turn <= np.percentile(turn, _QUIET_PERCENTILE)
         f = float(np.median(np.linalg.norm(imu.accel[quiet], axis=1)))
-    if (sentence := _find_scale(f)) is not None:
-        steady = float(np.linalg.norm(imu.accel[quiet].mean(axis=0))) / max(f, 1e-9)
+    steady = float(np.linalg.norm(imu.accel[quiet].mean(axis=0))) / max(f, 1e-9)
+    period = float(np.median(np.diff(imu.t))) if steady > _STEADY else None
+    if (sentence := _find_scale(f, period)) is not None:
         sentence = _NO_GRAVITY if _lacks_gravity(recording, f, steady) else sentence
         g = STANDARD_GRAVITY if recording.gnss is None else _measure_gravity(recording)
         yield Finding(
@@ -242,8 +243,11 @@ def _measure_gravity(recording: Recording) -> float:
     return float(gravity(*np.median(there, axis=0)[[0, 2]])) if len(there) else STANDARD_GRAVITY
 
 
-def _find_scale(f: float) -> str | None:
-    """The likely unit or scale of a force at rest that is not gravity; None if it is."""
+def _find_scale(f: float, period: float | None) -> str | None:
+    """The likely unit or scale of a force at rest that is not gravity; None if it is.
+
+    A steady one over `period`, s, may be an increment of velocity.
+    """
     g = STANDARD_GRAVITY
     if NEAR_FACTOR[0] < f / g < NEAR_FACTOR[1]:
         return None
@@ -253,6 +257,10 @@ def _find_scale(f: float) -> str | None:
     near = min(units, key=lambda value: abs(np.log(max(f, 1e-9) / value)))
     if 1.0 / _UNIT_RATIO < f / near < _UNIT_RATIO:
         return f"{units[near]} in [imu]"
+    if period is not None and 1.0 / _UNIT_RATIO < f / (g * period) < _UNIT_RATIO:
+        return (
+            'these are increments of velocity, of a sample each: set units = { gyro = "rad", accel = "m/s" } in [imu]'
+        )
     if f < g / FORCE["g"]:
         return _NO_GRAVITY
     step = round(float(np.log2(f / g))) if np.isfinite(f) else 0

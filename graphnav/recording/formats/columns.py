@@ -15,6 +15,9 @@ _ACCEL = (
     r"(?:.*_)?(?:acc\w*?|g_?force|beschleunigung|acel\w*?|linear_acceleration|total_acceleration|specific_force|imu_a|imu_f|force"
     r"|a|f)_?"
 )
+# increments over a sample
+_TURN = r"(?:.*_)?(?:d(?:el(?:ta)?)?_?(?:theta|ang(?:le)?)|angle?_?inc(?:rement)?)_?"
+_PUSH = r"(?:.*_)?(?:d(?:el(?:ta)?)?_?v(?:el(?:ocity)?)?|vel(?:ocity)?_?inc(?:rement)?)_?"
 _HORIZONTAL = r"sd_?h|(?:.*_)?(?:h_?acc\w*|horizontal_accuracy)|accuracy|eph|epe(?:_m)?"
 _VERTICAL = r"sd_?v|(?:.*_)?(?:v_?acc\w*|vertical_accuracy)|altitude_accuracy|epv"
 _COVARIANCE = r"(?:.*_)?position_cov(?:ariance)?_?"  # of ROS, 3 x 3 by rows, east, north, up
@@ -36,8 +39,8 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"date_?time|unix|epoch|utc|(?:uhr)?zeit(?:stempel)?|clock|hora|heure|tiempo|temps|date|datum|millis|micros|ms|us|ns",
     ),
     "week": (r"(?:gps_?)?(?:week|wn)(?:_?(?:no|num|number))?",),
-    **{f"g{x}": (rf"{_GYRO}{x}",) for x in "xyz"},
-    **{f"a{x}": (rf"{_ACCEL}{x}",) for x in "xyz"},
+    **{f"g{x}": (rf"{_GYRO}{x}", rf"{_TURN}{x}") for x in "xyz"},
+    **{f"a{x}": (rf"{_ACCEL}{x}", rf"{_PUSH}{x}") for x in "xyz"},
     "lat": (r"(?:.*_)?lat(?:itude?)?", r"breite(?:ngrad)?"),
     "lon": (r"(?:.*_)?(?:lon|lng|long|longitude?)", r"l_nge(?:ngrad)?|laenge(?:ngrad)?"),
     "h": (
@@ -92,6 +95,13 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     "resid_rms_m": (r"resid(?:ual)?s?_?rms(?:_m)?", r"rms_?(?:of_?)?resid(?:ual)?s?(?:_m)?"),
 }  # fmt: skip
 
+# of a reference beside fixes, whose course may be called its heading
+_ATTITUDE_PATTERNS = {
+    "roll": (r"(?:.*_)?roll(?:_angle)?",), "pitch": (r"(?:.*_)?pitch(?:_angle)?",),
+    "heading": (r"(?:.*_)?(?:heading|azimuth|hdg)(?:_angle)?", r"(?:.*_)?yaw(?:_angle)?"),
+}  # fmt: skip
+ATTITUDE = tuple(_ATTITUDE_PATTERNS)
+
 NAMED_UNITS = {
     "s": ("t", "s"), "sec": ("t", "s"), "seconds": ("t", "s"), "ms": ("t", "ms"), "us": ("t", "us"), "ns": ("t", "ns"),
     "dps": ("gyro", "deg/s"), "deg_s": ("gyro", "deg/s"), "degps": ("gyro", "deg/s"), "deg_sec": ("gyro", "deg/s"),
@@ -120,7 +130,7 @@ class FileColumns:
 
     @property
     def sensor(self) -> str | None:
-        """The sensor of the file, a key of `logs.WANTED`, or None; gravity is a phone's own estimate of it."""
+        """The sensor of the file, as `graphnav.recording.draft.logs` names them, or None; gravity is a phone's own."""
         gyro, accel = ({f"{s}{x}" for x in "xyz"} <= self.names.keys() for s in "ga")
         if "t" not in self.names:
             return None
@@ -158,6 +168,8 @@ def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
             names[f"{kind}{x}"] = bare[x][0]
             if bare[x][1]:
                 units[f"{kind}{x}"] = bare[x][1]
+    if names.get("speed") in {names.get(f"a{x}") for x in "xyz"}:
+        names.pop("speed", None)
     if {"lat", "lon"} <= names.keys() and split_unit(names.get("speed", ""))[0].endswith("x"):
         del names["speed"]  # one of three components, in axes that are not stated
     if "week" in names and not re.fullmatch(_OF_WEEK, split_unit(names.get("t", ""))[0]):
@@ -168,6 +180,23 @@ def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
             for x in "xyz":
                 names.pop(f"{kind}{x}", None)
     return FileColumns(names, units)
+
+
+def is_increment(name: str) -> bool:
+    """Whether a column of an IMU is called as increments of angle or velocity are."""
+    return re.fullmatch(rf"(?:{_TURN}|{_PUSH})[xyz]", split_unit(name)[0]) is not None
+
+
+def match_attitude(header: Sequence[str]) -> FileColumns:
+    """Match the columns of roll, pitch and heading."""
+    spelt = [some for name in header if not _UNCERTAIN.fullmatch((some := (name, *split_unit(name)))[1])]
+    found = {
+        ours: one
+        for ours, patterns in _ATTITUDE_PATTERNS.items()
+        for one in [next((some for p in patterns for some in spelt if re.fullmatch(p, some[1])), None)]
+        if one is not None
+    }
+    return FileColumns({o: one[0] for o, one in found.items()}, {o: one[2] for o, one in found.items() if one[2]})
 
 
 def find_wheels(header: Sequence[str]) -> list[str]:
