@@ -12,12 +12,12 @@ from graphnav.core.rotation import Array
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.noise.spacing import find_grid_start, select_best_fixes
 from graphnav.estimation.noise.unmeasured import mark_copies
-from graphnav.online.buffers import Buffer
+from graphnav.online.buffers import SAME, Buffer
 from graphnav.recording import Gnss
 
 _WIDTH = 21  # after a fix's values six typical sigmas, whether it is used, rms of its residuals and satellites
 _USED, _RESIDUALS = 19, 20
-_COPY = -1.0  # in the last column: a copy of the fix before
+_VOID = -1.0  # no measurement: a copy of the fix before, or filled in
 _NEAR = 8  # rows either side of a new one among which copies are sought
 _AVERAGED_OVER = 60.0  # s over which the typical sigma of fixes is averaged
 
@@ -39,6 +39,7 @@ class Fixes(Buffer):
         # begin and duration of the spans, s, of which the best fix is used
         self._grid: tuple[float, float] | None = None
         self._unit: Array | None = None  # `unit`, once determined
+        self._filled: list[tuple[float, float]] = []  # s, stretches that a logger has filled in
         self._means: dict[str, tuple[float, tuple[float, ...]]] = {}  # typical sigmas, and since when
 
     @property
@@ -51,7 +52,32 @@ class Fixes(Buffer):
         position, velocity = (self._track_sigma(kind, t, values[k : k + 3]) for kind, k in (("p", 3), ("v", 9)))
         of_residuals = values[12:] or (math.nan, math.nan)
         self._states_residuals |= math.isfinite(of_residuals[0])
-        return (*values[:12], *position, *velocity, 1.0, *of_residuals)
+        used = _VOID if self._is_filled(t) else 1.0
+        return (*values[:12], *position, *velocity, used, *of_residuals)
+
+    def leave_out_filled(self, t: float, measured: Array) -> None:
+        """Leave out the fixes, there or to come, between the IMU's measured rows (N,) before and after a time, s.
+
+        What was logged of the IMU there was filled in, and a logger that stalls fills in all that it logs.
+        """
+        at = int(np.searchsorted(measured, t))
+        begin, end = measured[max(at - 1, 0)], measured[min(at, len(measured) - 1)]
+        if self._filled and self._filled[-1][0] == begin:  # which has gone on
+            self._filled.pop()
+        self._filled.append((float(begin), float(end)))
+        self._mark_filled()
+
+    def _mark_filled(self) -> None:
+        for begin, end in self._filled:
+            self.rows[slice(*np.searchsorted(self.t, [begin + SAME, end - SAME])), _USED] = _VOID
+
+    def _is_filled(self, t: float) -> bool:
+        return any(begin + SAME < t < end - SAME for begin, end in self._filled)
+
+    def drop_before(self, t: float) -> None:
+        """Drop the rows before a time."""
+        super().drop_before(t)
+        self._filled = [one for one in self._filled if one[1] > t]
 
     def forget_typical(self) -> None:
         """Reset the typical sigmas: what follows is of another receiver or clock."""
@@ -62,28 +88,29 @@ class Fixes(Buffer):
         self.rows[:, _USED], self._grid, self.left = 1.0, None, []
         self._selects = spacing is not None
         gnss = self.select_as_gnss(-np.inf, np.inf)
+        self._mark_filled()
         if spacing is None or gnss is None or len(gnss.t) < 2:
             return
-        self.rows[mark_copies(gnss), _USED] = _COPY
+        self.rows[mark_copies(gnss), _USED] = _VOID
         if find_fix_period(gnss.t) > 0.5 * spacing:
             return
         begin = find_grid_start(gnss)
         self._grid = begin, spacing
-        own = np.flatnonzero(self.rows[:, _USED] != _COPY)
+        own = np.flatnonzero(self.rows[:, _USED] != _VOID)
         gnss = pick_fixes(gnss, own)
         self.rows[own, _USED] = 0.0
         self.rows[own[select_best_fixes(gnss, np.floor((gnss.t - begin) / spacing))], _USED] = 1.0
 
     def choose(self, t: float) -> bool:
         """Whether a new fix is no copy and among the best of its span; those that no longer are go to `left`."""
-        if self._selects and self._is_copy(t):
+        if self._is_filled(t) or (self._selects and self._is_copy(t)):
             return False
         if self._grid is None:
             return True
         begin, spacing = self._grid
         span = np.floor((t - begin) / spacing)
         near = self.rows[slice(*np.searchsorted(self.t, [t - 1.1 * spacing, t + 1.1 * spacing]))]
-        rows = np.flatnonzero((np.floor((near[:, 0] - begin) / spacing) == span) & (near[:, _USED] != _COPY))
+        rows = np.flatnonzero((np.floor((near[:, 0] - begin) / spacing) == span) & (near[:, _USED] != _VOID))
         gnss = self._make_gnss(near[rows])
         assert gnss is not None
         best = rows[select_best_fixes(gnss, np.zeros(len(rows)))]
@@ -102,7 +129,7 @@ class Fixes(Buffer):
         assert gnss is not None
         copied = mark_copies(gnss)
         self.left += [float(x) for x in near[copied & (near[:, _USED] > 0.0), 0] if x != t]
-        near[copied, _USED] = _COPY
+        near[copied, _USED] = _VOID
         return bool(copied[at - first])
 
     def compute_typical_sigmas(self, t: Array) -> Array:

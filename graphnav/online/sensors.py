@@ -264,8 +264,9 @@ class Sensors:
     def _take_back(self, found: list[tuple[float, str]]) -> None:
         for t, why in found:
             self.imu.drop(t)
-            self.counts["imu"] -= 1
-            self.counts[f"imu: {why}"] += 1
+            self.counts.update({"imu": -1, f"imu: {why}": 1})
+            if why == FILLED:
+                self.gnss.leave_out_filled(t, self.imu.t)
 
     def release(self) -> None:
         """No more IMU rows will arrive: release the held rows."""

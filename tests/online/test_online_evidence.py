@@ -15,8 +15,16 @@ from graphnav.estimation.faults.watch import Watch
 from graphnav.online import Online, drop_rows, list_rows, smoother
 from graphnav.online.judgement import WindowJudge
 from graphnav.recording import Recording
+from graphnav.recording.plausibility.filled import find_filled
 
 _JUDGE = {"holds": WindowJudge.holds, "look": WindowJudge.look}
+
+
+def without_filled_rows(recording: Recording) -> Recording:
+    """As if the logger had lost rows of the IMU, and none of the fixes meanwhile."""
+    imu = recording.imu
+    measured = ~find_filled(imu.t, np.hstack([imu.gyro, imu.accel]).T)[0]
+    return replace(recording, imu=replace(imu, t=imu.t[measured], gyro=imu.gyro[measured], accel=imu.accel[measured]))
 
 
 def test_no_right_fix_is_left_out_that_the_noise_model_was_estimated_from() -> None:
@@ -34,8 +42,8 @@ def test_no_right_fix_is_left_out_that_the_noise_model_was_estimated_from() -> N
 
 
 def test_what_fills_a_gap_of_the_imu_is_not_taken_for_a_fault_of_the_fixes_behind_it() -> None:
-    """The noise model of the first seconds, and a gap of a second and a half behind them."""
-    recording = load("kitti").crop(171.4, 218.4).without("gnss", (40.0, 60.0))
+    """The noise model of the first seconds, and a gap of a second and a half behind them, in which fixes are used."""
+    recording = without_filled_rows(load("kitti")).crop(171.4, 222.4).without("gnss", (40.0, 60.0))
     online, left_out = Online(drop_rows(recording)), set()
     for row in list_rows(recording)[1]:
         online.add(row)
@@ -48,8 +56,8 @@ def test_what_fills_a_gap_of_the_imu_is_not_taken_for_a_fault_of_the_fixes_behin
 @pytest.mark.parametrize("engine", ["window", "isam2"])
 def test_sigmas_at_once_are_true_behind_a_gap_of_the_imu_in_an_outage(engine: str) -> None:
     """A second and a half in a turn: whole Gauss-Newton steps swing by degrees, and each makes sigmas smaller."""
-    whole = load("kitti").crop(171.4, 230.5)
-    recording, squares = whole.without("gnss", (40.0, 60.0)), []
+    whole = load("kitti").crop(161.4, 230.5)
+    recording, squares = whole.without("gnss", (50.0, 70.0)), []
     online, newest = Online(drop_rows(recording), parse_settings({"vehicle": {"nhc": True}}), engine), -np.inf
     assert whole.gnss is not None
     for row in list_rows(recording)[1]:
@@ -59,11 +67,11 @@ def test_sigmas_at_once_are_true_behind_a_gap_of_the_imu_in_an_outage(engine: st
             continue
         newest, message = tracker.newest, tracker.window.newest
         k = int(np.argmin(np.abs(whole.gnss.t - newest)))
-        if newest > recording.start + 46.0 and abs(whole.gnss.t[k] - newest) < 0.02:
+        if newest > recording.start + 56.0 and abs(whole.gnss.t[k] - newest) < 0.02:
             off = message.state.p[0] - tracker.frame.from_llh(whole.gnss.llh[k][None])[0]
             squares.append(off @ np.linalg.solve(message.covariance[3:6, 3:6], off) / 3.0)
     assert len(squares) > 4
-    assert np.mean(squares) < 6.0  # fixes are off, too
+    assert np.mean(squares) < 10.0  # fixes are off, too; by whole steps 19
 
 
 def play(recording: Recording) -> Online:

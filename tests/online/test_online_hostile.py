@@ -114,19 +114,26 @@ def test_a_reading_that_those_around_contradict_costs_its_interval(
     assert np.abs(error / sd).max() < 6.0
 
 
-@pytest.mark.parametrize("at", [36.28, 56.52])
+@pytest.mark.parametrize("late", [0.0, 0.3])
+@pytest.mark.parametrize("at", [35.72, 56.52])
 def test_rows_filled_in_on_straight_lines_count_as_missing(
-    drive: tuple[Recording, Trajectory], rows: list[Row], at: float
+    drive: tuple[Recording, Trajectory], rows: list[Row], at: float, late: float
 ) -> None:
-    """Half a second, before there is a state, and when there is one, with the digits of all other rows."""
+    """Half a second, before there is a state, and when there is one, with the digits of all other rows.
+
+    The fix in it is filled in as well, half a metre off, and comes at once or later.
+    """
     written = [(s, t, tuple(round(x, 6) for x in v) if s == "imu" else v) for s, t, v in rows]
     imu = [row for row in written if row[0] == "imu"]
     inside = [t for _, t, _ in imu if at < t < at + 0.5]
     times = np.array([t for _, t, _ in imu if t <= at or t >= at + 0.5])
     values = np.array([v for _, t, v in imu if t <= at or t >= at + 0.5])
     line = {t: tuple(round(float(np.interp(t, times, x)), 6) for x in values.T) for t in inside}
-    filled = [(s, t, line[t] if s == "imu" and t in line else v) for s, t, v in written]
-    missing = [row for row in written if row[0] != "imu" or row[1] not in line]
+    (fix,) = (row for row in written if row[0] == "gnss" and at < row[1] < at + 0.5)
+    filled = [(s, t, line[t] if s == "imu" and t in line else v) for s, t, v in written if (s, t, v) != fix]
+    behind = next(k for k, row in enumerate(filled) if row[1] >= fix[1] + late)
+    filled.insert(behind, ("gnss", fix[1], (fix[2][0] + 0.5 / 6.4e6, *fix[2][1:])))
+    missing = [row for row in written if row != fix and (row[0] != "imu" or row[1] not in line)]
     online, track = played(drive[0], filled, QUICK)
     assert online.sensors.counts["imu: on a straight line between those around"] == len(inside)
     same(track, played(drive[0], missing, QUICK)[1])
