@@ -129,7 +129,8 @@ def begin_jointly(
     other = _estimate_with_worse_imu(stated, first, opening, progress)
     if other is None:
         return free_in(first)
-    if other.log_evidence <= first.log_evidence + first.gained_by_chance:
+    # estimates end within as much again of their optima
+    if other.log_evidence <= first.log_evidence + 2.0 * first.gained_by_chance:
         return free_in(replace(first, passes=first.passes + other.passes))
     return replace(free_in(other), rival=free_in(first))
 
@@ -143,15 +144,12 @@ def _estimate_with_worse_imu(
     A bias walk that is small beside all other noise changes nothing, so that no step leads from there to an optimum at
     which it explains everything.
     """
-    figures = found.noise.figures
-    aiding = [x for name, x in figures.items() if not name.startswith(("imu.", "prior."))]  # of offsets, no noise
-    most = max(((x.log_factor - x.prior) / x.prior_sigma for x in aiding), default=0.0)
-    if most <= 1.0:
+    if found.excess <= 1.0:
         return None
     worse = {}
-    for name in figures:
+    for name in found.noise.figures:
         median, sigma = get_prior(name)
-        worse[name] = VarianceComponent(median + name.startswith("imu.") * most * sigma)
+        worse[name] = VarianceComponent(median + name.startswith("imu.") * found.excess * sigma)
     with contextlib.suppress(*BREAKDOWN):
         return estimate_noise(stated, opening, NoiseModel(worse), progress=progress, changed=True)
     return None

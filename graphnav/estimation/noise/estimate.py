@@ -75,6 +75,13 @@ class NoiseEstimate:
         """Log-likelihood that its figures gain by being estimated, in the mean."""
         return 0.5 * len(self.noise.figures)
 
+    @property
+    def excess(self) -> float:
+        """By how many prior sigmas an aiding sensor is worse than its prior's median, the worst one."""
+        figures = self.noise.figures.items()
+        aiding = [x for name, x in figures if not name.startswith(("imu.", "prior."))]  # of offsets, no noise
+        return max(((x.log_factor - x.prior) / x.prior_sigma for x in aiding), default=0.0)
+
     def get_linearisation(self, base: Problem) -> tuple[Points, Problem]:
         """Its points and the problem that they are of, to start another estimate from."""
         return self.points, apply_noise(base, self.noise)
