@@ -20,8 +20,8 @@ decides what is left out.
 
 Masking. Figures that are estimated with a fault among the data may have grown until they hide it, so the tests are made
 with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans.
-Unless these explain the rest better than the figures found, beyond chance, nothing was masked. Where an aiding sensor is
-worse than its prior's sigma, that is concluded only if figures estimated from the priors do not either. Each set of
+Unless these explain the rest better than the figures found, beyond chance, nothing was masked. Where an aiding sensor
+is worse than its prior's sigma, that is concluded only if figures estimated from the priors do not either. Each set of
 spans that comes up on the way is decided by these figures, and the decision with the largest evidence stands. All that
 is done once more, as the spans shrink to what is wrong, unless the figures lose more evidence inside them than they
 gain outside. If no fault is left, the estimate that uses all measurements and starts from these figures is a candidate.
