@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +13,11 @@ from test_faults import left_out, moved
 
 from graphnav import load
 from graphnav.config import Settings
+from graphnav.constraints.vehicle import MOUNTING
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import get_key
+from graphnav.core.state import States
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation import joint_estimate
@@ -22,7 +25,9 @@ from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.alignment.motion import drop_implausible
 from graphnav.estimation.faults.verdicts import Verdicts
+from graphnav.estimation.noise.words import describe_turned_axes
 from graphnav.estimation.pipeline import choose_origin, run
+from graphnav.estimation.solvers.linearise import Points
 from graphnav.evaluation.scoring import Errors, compute_errors
 from graphnav.online import Online, drop_rows, list_rows
 from graphnav.recording import Recording
@@ -164,6 +169,22 @@ def test_axes_that_are_a_quarter_turn_off_are_told(shared_data: Path) -> None:
     track = turned.trajectory()
     off = np.interp(slow.truth.t, track.t, np.unwrap(track.rph[:, 2])) - np.unwrap(slow.truth.rph[:, 2])
     assert abs(np.degrees(np.angle(np.mean(np.exp(1j * off))))) < 10.0
+
+
+@pytest.mark.parametrize(("side_slip", "told"), [(0.1, True), (1.0, False)])
+def test_axes_are_no_matter_of_what_drifts(side_slip: float, told: bool) -> None:
+    """A mounting found a quarter turn off, of a car that travels along those axes, and of a boat that does not."""
+    mounting = SimpleNamespace(
+        parameter=SimpleNamespace(name=MOUNTING), mean=np.zeros((1, 2)), sigma=np.full((1, 2), np.radians(6.0))
+    )
+    imu = SimpleNamespace(R_bs=np.eye(3))
+    problem = SimpleNamespace(chains=[mounting], columns={MOUNTING: slice(15, 17)}, recording=SimpleNamespace(imu=imu))
+    rng, n = np.random.default_rng(1), 500
+    v = np.stack([3.0 + 0.5 * rng.standard_normal(n), 3.0 * side_slip * rng.standard_normal(n), np.zeros(n)], axis=-1)
+    states = States(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), v, np.zeros((n, 3)), np.zeros((n, 3)))
+    smoothed = Points(states, np.tile([0.0, -0.5 * np.pi], (n, 1)))
+    found = describe_turned_axes(problem, smoothed)  # type: ignore[arg-type]
+    assert (found is not None) == told
 
 
 def test_fixes_thousands_of_sigmas_off_leave_a_start() -> None:

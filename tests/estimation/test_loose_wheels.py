@@ -1,0 +1,30 @@
+"""Constraints of wheels, an assumption, where it does not hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from graphnav import load
+from graphnav.config import Settings
+from graphnav.core.earth import LocalFrame
+from graphnav.detectors import detect
+from graphnav.estimation.alignment import align
+from graphnav.estimation.noise.components import Components
+from graphnav.estimation.noise.estimate import estimate_noise
+from graphnav.estimation.pipeline import choose_origin
+from graphnav.estimation.problem import build_problem
+
+
+def test_a_motorbike_that_leans_is_believed(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Begun as stated, the constraints stay ten times as tight, at an optimum that is 77 nats less likely."""
+    recording, settings = load(shared_data / "motorbike_dresden_20160809"), Settings()
+    frame, stops = LocalFrame(choose_origin(recording), recording.start), detect(recording, settings).stationary
+    aligned = align(recording, settings, frame, stops)
+    base = build_problem(recording, settings, frame, aligned.state, aligned.sigma, stops, parts_of_noise=True)
+    loose = estimate_noise(base, aligned.until)
+    monkeypatch.setattr(Components, "doubt_wheels", lambda *_: None)
+    tight = estimate_noise(base, aligned.until)
+    assert loose.log_evidence > tight.log_evidence + 2.0 * loose.gained_by_chance
+    assert loose.noise.figures["nhc.up"].factor > 1.0 > 10.0 * tight.noise.figures["nhc.up"].factor
