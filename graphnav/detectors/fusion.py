@@ -190,12 +190,12 @@ def _screen_motion(b: BlockMeans, spans: Array, speeds: list[Speeds], certain: A
 
 def _find_turning(b: BlockMeans, spans: Array) -> NDArray[np.bool_]:
     """Which of M spans (M, 2) turn steadily: whose mean rate is not the median of the rates in all of them."""
-    inside = np.stack([(b.t > start) & (b.t < end) for start, end in spans])
-    counted = inside.any(axis=0)
-    if not counted.any():
+    rates = [b.rate[first:end] for first, end in np.searchsorted(b.t, spans).tolist()]
+    every = np.concatenate(rates)
+    if not len(every):
         return np.zeros(len(spans), dtype=bool)
-    excess = b.rate - compute_share(b.rate[counted], 0.5)
-    return np.array([of.any() and bool((np.abs(excess[of].mean(axis=0)) > _BIAS_CHANGE).any()) for of in inside])
+    usual = compute_share(every, 0.5)
+    return np.array([len(x) > 0 and bool((np.abs(x.mean(axis=0) - usual) > _BIAS_CHANGE).any()) for x in rates])
 
 
 def _share_still_in_motion(found: Detection, certain: Array) -> float:
