@@ -17,7 +17,7 @@ from graphnav.core.timescales import unix_to_gps
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Gnss, Recording, Truth
 from graphnav.recording.formats import read
-from graphnav.recording.formats.schema import parse_axes_letters
+from graphnav.recording.formats.axes import parse_axes_letters
 from graphnav.sensors.barometer import compute_standard_pressure
 
 UNIX = 1751990400.0  # s, 8 July 2025, 16:00 UTC, a second after the start of every cut

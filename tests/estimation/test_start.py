@@ -31,7 +31,7 @@ from graphnav.estimation.solvers.linearise import Points
 from graphnav.evaluation.scoring import Errors, compute_errors
 from graphnav.online import Online, drop_rows, list_rows
 from graphnav.recording import Recording
-from graphnav.recording.formats.schema import parse_axes_letters
+from graphnav.recording.formats.axes import parse_axes_letters
 
 HERE = Path(__file__).resolve().parents[2]
 STATED = Settings.model_validate({"noise": {"mode": "stated"}})

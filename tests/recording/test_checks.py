@@ -24,7 +24,7 @@ from graphnav.recording.checks.crosschecks import fit_yaw_rate
 from graphnav.recording.checks.overview import Inspection, inspect
 from graphnav.recording.checks.tracks import compute_track
 from graphnav.recording.formats import read
-from graphnav.recording.formats.schema import parse_axes_letters
+from graphnav.recording.formats.axes import parse_axes_letters
 from graphnav.recording.plausibility.screening import screen
 from graphnav.simulation import simulate
 

@@ -19,7 +19,7 @@ from graphnav.recording.checks.overview import inspect
 from graphnav.recording.draft import draft, guesses, motion
 from graphnav.recording.draft.agreement import find_level_axes
 from graphnav.recording.formats import columns, read
-from graphnav.recording.formats.schema import parse_axes_letters
+from graphnav.recording.formats.axes import parse_axes_letters
 
 DRIVE, _ = oracle.drive(
     oracle.vehicle_path(240.0, 50.0), seed=3, gnss_rate=5.0, gnss_velocity_sd=(0.05, 0.05, 0.1), odometer_rate=20.0

@@ -16,8 +16,8 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import get_key
 from graphnav.recording import ImuNoise
 from graphnav.recording.formats import list_formats, read
+from graphnav.recording.formats.axes import parse_axes_letters, parse_axes_vectors
 from graphnav.recording.formats.repair import DEFAULT_SD
-from graphnav.recording.formats.schema import parse_axes_letters, parse_axes_vectors
 
 IMU_ROWS = "t,gx,gy,gz,ax,ay,az\n0.01,1,2,3,4,5,6\n0.02,1,2,3,4,5,6\n"
 

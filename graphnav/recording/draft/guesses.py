@@ -12,7 +12,8 @@ from graphnav.core.earth import STANDARD_GRAVITY
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.recording.draft import motion
-from graphnav.recording.formats.schema import FORCE, RATE_UNITS, SPEED, parse_axes_letters
+from graphnav.recording.formats.axes import parse_axes_letters
+from graphnav.recording.formats.schema import FORCE, RATE_UNITS, SPEED
 from graphnav.sensors import barometer
 from graphnav.sensors.barometer import ATMOSPHERE
 from graphnav.sensors.tables import TIME_UNITS

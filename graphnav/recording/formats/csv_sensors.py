@@ -27,11 +27,11 @@ from graphnav.recording.formats.repair import (
     parse_fix_types,
 )
 from graphnav.recording.formats.table import Table
+from graphnav.recording.plausibility.fixes import FASTEST
 from graphnav.sensors import Sensor, Series
 from graphnav.sensors.tables import ANGLE
 
 _ROWS_AT_ONCE = 1 << 16  # rows at once
-_FASTEST = 300.0  # m/s; larger ones stand for none (999)
 _SD_V = ("sd_ve", "sd_vn", "sd_vu")
 
 
@@ -109,11 +109,11 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Notes) -> Gnss:
     if len(there) == 3:
         v = rows.stack("ve", "vn", "vu") * scale
         absent = np.isnan(v).any(-1)
-        beyond = ~absent & (np.linalg.norm(v, axis=1) > _FASTEST)
+        beyond = ~absent & (np.linalg.norm(v, axis=1) > FASTEST)
         if 0 < beyond.sum() < 0.5 * len(v):  # else in another unit
             remarks.add(
                 "gnss.velocity_beyond",
-                f"{format_count(beyond.sum(), 'GNSS velocity', 'GNSS velocities')} of more than {_FASTEST:g} m/s, "
+                f"{format_count(beyond.sum(), 'GNSS velocity', 'GNSS velocities')} of more than {FASTEST:g} m/s, "
                 f"which no land vehicle reaches, left out (first at t = {rows['t'][beyond][0]:.3f} s)",
             )
             absent |= beyond

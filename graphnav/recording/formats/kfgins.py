@@ -27,6 +27,7 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK
 from graphnav.recording import Gnss, Imu, Odometer, Truth
+from graphnav.recording.formats.axes import parse_axes_letters
 from graphnav.recording.formats.increments import compute_periods, note_gaps
 from graphnav.recording.formats.kfgins_configuration import (
     find_file,
@@ -37,7 +38,6 @@ from graphnav.recording.formats.kfgins_configuration import (
 )
 from graphnav.recording.formats.places import is_on_earth
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.schema import parse_axes_letters
 from graphnav.recording.formats.text import parse_table, split_lines
 from graphnav.recording.formats.trajectories import read_trajectory
 

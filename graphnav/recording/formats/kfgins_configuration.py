@@ -18,7 +18,7 @@ from graphnav.core.files import is_inside, read_text
 from graphnav.core.notes import Notes
 from graphnav.core.rotation import Array
 from graphnav.recording import ImuNoise
-from graphnav.recording.formats.schema import parse_axes_letters
+from graphnav.recording.formats.axes import parse_axes_letters
 
 DEG_PER_H = np.pi / 180 / 3600  # rad/s
 DEG_PER_SQRT_H = np.pi / 180 / 60  # rad/s/sqrt(Hz)

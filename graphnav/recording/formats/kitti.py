@@ -16,8 +16,8 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording
+from graphnav.recording.formats.axes import parse_axes_letters
 from graphnav.recording.formats.registry import Format
-from graphnav.recording.formats.schema import parse_axes_letters
 
 NOMINAL_ORIGIN = (49.0, 8.4, 115.0)  # deg, deg, m: Karlsruhe; the file holds only local metres
 

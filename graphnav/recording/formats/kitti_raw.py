@@ -17,9 +17,9 @@ from graphnav.core.files import check_inside, parse_number
 from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Truth
+from graphnav.recording.formats.axes import parse_axes_letters
 from graphnav.recording.formats.places import is_on_earth
 from graphnav.recording.formats.registry import Log, log_format
-from graphnav.recording.formats.schema import parse_axes_letters
 from graphnav.recording.formats.text import split_lines
 
 _FIX_PERIOD = 1.0  # s; the smoothed positions of an INS, used more often, would count as independent fixes

@@ -21,9 +21,9 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import unix_to_gps
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, convert_fix_types
+from graphnav.recording.formats.axes import parse_axes_letters
 from graphnav.recording.formats.registry import Log, log_format
 from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V
-from graphnav.recording.formats.schema import parse_axes_letters
 
 _IMU, _FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
 _TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped", "nav_msgs/msg/Odometry")

@@ -25,6 +25,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import parse_clock
 from graphnav.recording import ImuNoise
+from graphnav.recording.formats.axes import parse_axes_letters, parse_axes_vectors
 from graphnav.recording.formats.figures import parse_figure
 from graphnav.recording.formats.imu_models import MODELS, find_model
 from graphnav.sensors import list_sensors
@@ -59,8 +60,6 @@ SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}
 
 AngleUnit = Literal["deg", "rad"]
 SpeedUnit = Literal["m/s", "km/h", "mph", "knots"]
-
-_LETTERS = {"R": (1, 0, 0), "L": (-1, 0, 0), "F": (0, 1, 0), "B": (0, -1, 0), "U": (0, 0, 1), "D": (0, 0, -1)}
 
 
 class ImuUnits(TomlTable):
@@ -347,34 +346,6 @@ class RecordingFile(TomlTable):
         if isinstance(of, str) and getattr(self, of) is None and not (of == "gnss" and self.raw_gnss is not None):
             raise ValueError(f"truth.of = '{of}', but there is no [{of}] table whose lever arm would apply")
         return self
-
-
-def parse_axes_letters(axes: str) -> Array:
-    """R_bs of three letters stating the directions of the file's x, y, z; 'BRU': x backward, y right, z up."""
-    if len(axes) != 3 or any(letter not in _LETTERS for letter in axes):
-        raise ValueError("must be three capitals out of R/L, F/B, U/D, such as RFU, FLU or FRD")
-    R_bs = np.array([_LETTERS[letter] for letter in axes], dtype=float).T
-    determinant = np.linalg.det(R_bs)
-    if abs(determinant) < 0.5:
-        raise ValueError("must use one of R/L, one of F/B and one of U/D")
-    if determinant < 0:
-        flipped = axes[:2] + {"U": "D", "D": "U", "R": "L", "L": "R", "F": "B", "B": "F"}[axes[2]]
-        raise ValueError(f"is a left-handed triple, which no sensor has; with z the other way it would be {flipped}")
-    return R_bs
-
-
-def parse_axes_vectors(forward: Sequence[float], up: Sequence[float]) -> Array:
-    """R_bs of two vectors in the file's axes: up is kept, forward is made perpendicular to it."""
-    f, u = np.asarray(forward, dtype=float), np.asarray(up, dtype=float)
-    if np.linalg.norm(f) < 1e-6 or np.linalg.norm(u) < 1e-6:
-        raise ValueError("forward and up must not be zero")
-    f, u = f / np.linalg.norm(f), u / np.linalg.norm(u)
-    square = f - (f @ u) * u
-    # closer than 10 degrees, errors of up turn forward into noise
-    if np.linalg.norm(square) < np.sin(np.radians(10.0)):
-        raise ValueError("forward and up are nearly parallel")
-    f = square / np.linalg.norm(square)
-    return np.stack([np.cross(f, u), f, u])
 
 
 def build_model() -> type[RecordingFile]:
