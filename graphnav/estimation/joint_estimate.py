@@ -117,7 +117,7 @@ def begin_jointly(
 
     def estimate(base: Problem, before: JointEstimate, start: NoiseModel | None = None) -> NoiseEstimate:
         near = before.estimate.get_linearisation(before.base)
-        return estimate_noise(base, opening, start, near, progress, changed=True)
+        return estimate_noise(base, opening, start, near, progress)
 
     def go_on(base: Problem, before: JointEstimate) -> NoiseEstimate:
         return estimate(base, before, before.estimate.noise)
@@ -125,12 +125,11 @@ def begin_jointly(
     def free_in(one: NoiseEstimate) -> JointEstimate:
         return _free_constants(JointEstimate(stated, {}, one), settings, go_on, estimate)
 
-    first = estimate_noise(stated, opening, start, progress=progress, changed=True)
+    first = estimate_noise(stated, opening, start, progress=progress)
     other = _estimate_with_worse_imu(stated, first, opening, progress)
     if other is None:
         return free_in(first)
-    # estimates end within as much again of their optima
-    if other.log_evidence <= first.log_evidence + 2.0 * first.gained_by_chance:
+    if other.log_evidence <= first.log_evidence + first.gained_by_chance:
         return free_in(replace(first, passes=first.passes + other.passes))
     return replace(free_in(other), rival=free_in(first))
 
@@ -151,7 +150,7 @@ def _estimate_with_worse_imu(
         median, sigma = get_prior(name)
         worse[name] = VarianceComponent(median + name.startswith("imu.") * found.excess * sigma)
     with contextlib.suppress(*BREAKDOWN):
-        return estimate_noise(stated, opening, NoiseModel(worse), progress=progress, changed=True)
+        return estimate_noise(stated, opening, NoiseModel(worse), found.get_linearisation(stated), progress)
     return None
 
 
@@ -209,7 +208,7 @@ def _estimate_scales(found: JointEstimate, progress: Progress | None) -> JointEs
     # the figures found lead to the nearest optimum soonest; with other scale errors behind them it may be a bad one
     for start in (best.noise, NoiseModel(weights=best.noise.weights, excluded=best.noise.excluded)):
         with contextlib.suppress(*BREAKDOWN):
-            one = estimate_noise(base, None, start, near, progress, intervals, changed=True, scales=True)
+            one = estimate_noise(base, None, start, near, progress, intervals, scales=True)
             other = replace(found, estimate=one).weigh()
             passes = passes + other.estimate.passes
             if other.compute_evidence() > limit:

@@ -33,6 +33,7 @@ from graphnav.estimation.noise.initial_points import Initial, anneal, find_initi
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import (
     collect_imu_moments,
+    collect_moments,
     collect_process_moments,
     collect_row_moments,
     lag_moments,
@@ -162,7 +163,8 @@ def test_information_is_the_derivative_of_the_squares() -> None:
     used, noise, about = mixed(base, opening)
     names = list(moments(used, about))
     forward = refilter(used, about, whole=False)
-    found = compute_information(used, forward, smooth_moments(used, forward), names)
+    smoothed = smooth_moments(used, forward)
+    found = compute_information(used, forward, smoothed, collect_moments(used, about.states.R_nb, smoothed), names)
     A = np.array([A for A, _ in moments(used, about).values()])
     h = 0.01
     for j, name in enumerate(names):
@@ -224,7 +226,9 @@ def test_lag_moments_are_the_derivative_of_the_likelihood_by_the_correlation_tim
     for chain in lasting:
         p = chain.parameter
         assert p.correlation_time is not None
-        dt, left, later, cross, before = lag_moments(used, chain, smoothed, K)
+        dt, left, later, cross, before = lag_moments(
+            used, chain, smoothed, collect_process_moments(used, chain, smoothed, K)
+        )
 
         def expected(time: float, p=p, dt=dt, left=left, later=later, cross=cross, before=before) -> float:
             a = (np.exp(-dt / time) * left)[:, None]

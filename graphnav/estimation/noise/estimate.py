@@ -1,23 +1,23 @@
 """All noise figures of a recording at once, by the likelihood of its innovations.
 
 Maximum a posteriori: with L the innovation log-likelihood of the filter and a log-normal prior on every variance
-factor, the estimate maximises L plus the logarithm of the priors. From pass to pass, filter and smoother linearised at
-the points that the pass before left, every factor f with redundancy B and the sum of squares A
-(`graphnav.estimation.noise.moments`) goes to the maximum over x = ln(f_new / f) of
-
-    -(B x + A e^-x) / 2 - (ln f + x - m)^2 / (2 s^2)
-
-the likelihood of A / f as a chi-square variable of B degrees of freedom, and the prior. Without a prior that is the
-fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992). All sensors are estimated at
-once, so none is favoured by the order. Squares of rows have the weights of their tails, whose index is estimated in the
-same pass (`graphnav.estimation.noise.tails`); of the IMU and of processes, a square counts for no more than the value
-that it exceeds once in a thousand times (`CHANCE`). The first passes of a long drive use its first `_FIRST_KEYFRAMES`
-keyframes only.
+factor, the estimate maximises L plus the logarithm of the priors. In each pass, filter and smoother linearised at the
+points that the pass before left give every factor's redundancy B and sum of squares A
+(`graphnav.estimation.noise.moments`), the gradient (A - B) / 2, and the average information of all
+(`graphnav.estimation.noise.information`): a Newton step of all of them together
+(`graphnav.estimation.noise.components`), so that no sensor is favoured by the order. Without a prior, the step of one
+factor by itself is the fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992).
+Squares of rows have the weights of their tails, whose index is estimated in the same pass
+(`graphnav.estimation.noise.tails`); of the IMU and of processes, a square counts for no more than the value that it
+exceeds once in a thousand times (`CHANCE`). The correlation time of a process is a step of expectation-maximisation
+apart, at the driving noise that the data determine best. Where a pass has less evidence than one before, the next step
+is half as long: weights and figures may alternate between two states. The first passes of a long drive use its first
+`_FIRST_KEYFRAMES` keyframes only.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -27,17 +27,11 @@ from scipy.special import chdtri
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import apply_noise, select_weights
-from graphnav.estimation.noise.components import Components, begin_components
+from graphnav.estimation.noise.components import Components, Squares, begin_components
 from graphnav.estimation.noise.information import compute_information
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
-from graphnav.estimation.noise.moments import (
-    ImuMoments,
-    collect_imu_moments,
-    collect_process_moments,
-    collect_row_moments,
-    lag_moments,
-)
+from graphnav.estimation.noise.moments import ImuMoments, Moments, collect_moments, lag_moments
 from graphnav.estimation.noise.outliers import compute_interval_cost, compute_row_costs, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN
 from graphnav.estimation.noise.tails import CHANCE, compute_bounded_mean, estimate_tail_index, weigh_scaled
@@ -50,12 +44,14 @@ from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 _FIRST_KEYFRAMES = 1500  # keyframes: a variance estimated from a thousand numbers is good to a twentieth
-_ROUNDS, _AGAIN = 8, 3  # passes to convergence, from the priors and from figures that were estimated before
-_MAX_PASSES = 3 * _ROUNDS  # passes at most
-_EXTRAPOLATION = 2.0  # longest step, in steps as computed (Aitken's extrapolation)
+_MAX_PASSES = 24  # passes at most
+_CHANCE_GAIN = 0.5  # log-likelihood that a figure gains by being estimated, in the mean
+_SETTLED = 0.1  # gain of a pass below which estimates have converged, in what they gain by chance
+_UNSETTLED = 3  # passes without a gain at most
 _TIME_RANGE = 30.0  # factor by which a correlation time may differ from its prior median either way
 _MANOEUVRE = 1.0, 10.0  # rad/s, m/s^2, of a vehicle: uncertainty of an interval whose samples are lost
 _TIME_GRID = np.linspace(-1.0, 1.0, 21)
+_RELAXATION = 1.5  # steps of times, in steps of expectation-maximisation; below 2, they converge as surely
 
 
 @dataclass(frozen=True)
@@ -73,7 +69,7 @@ class NoiseEstimate:
     @property
     def gained_by_chance(self) -> float:
         """Log-likelihood that its figures gain by being estimated, in the mean."""
-        return 0.5 * len(self.noise.figures)
+        return _CHANCE_GAIN * len(self.noise.figures)
 
     @property
     def excess(self) -> float:
@@ -98,7 +94,6 @@ def estimate_noise(
     near: tuple[Points, Problem] | None = None,
     progress: Callable[[str, float], None] | None = None,
     intervals: bool = False,
-    changed: bool = False,
     scales: bool = False,
 ) -> NoiseEstimate:
     """Estimate the noise model of a problem built with stated noise and with the parts of its intervals' noise.
@@ -109,7 +104,6 @@ def estimate_noise(
     start : initial figures, weights of rows, and what is left out; prior medians when None.
     near : first linearisation points, of all keyframes, and the problem that they are of.
     intervals : whether single intervals of the IMU may have more noise than the others.
-    changed : whether the initial figures were estimated with other measurements left out, and may have far to go.
     scales : whether the IMU's scale errors may be larger or smaller than stated.
 
     Raises
@@ -117,7 +111,7 @@ def estimate_noise(
     EstimationError
         If the filter breaks down.
     """
-    figures = begin_components(problem, start, changed, scales)
+    figures = begin_components(problem, start, scales)
     if near is not None:
         return _iterate(
             problem, figures, reuse_points(*near, apply_noise(problem, figures.build_model())), progress, intervals
@@ -130,7 +124,7 @@ def estimate_noise(
         initials = [replace(one, points=reuse_points(one.points, problem, used)) for one in initials]
     found: list[NoiseEstimate] = []
     for initial in initials:
-        figures = begin_components(problem, start, changed, scales)
+        figures = begin_components(problem, start, scales)
         figures.weights |= initial.weights
         for name, more in initial.log_factors.items():
             figures.log[name] += more
@@ -154,58 +148,68 @@ def _iterate(
     intervals: bool,
 ) -> NoiseEstimate:
     """Iterate from initial figures and linearisation points to convergence."""
-    done, total, converged = 0, len(problem.t), False  # keyframes
+    done, total = 0, len(problem.t)  # keyframes
     long = total > 2 * _FIRST_KEYFRAMES and not figures.known
     latest: tuple[ForwardRecord, MomentPass] | None = None
     for end in (_FIRST_KEYFRAMES, total) if long else (total,):
-        rounds = _AGAIN if figures.same_data or done else _ROUNDS
-        before, converged, figures.extrapolation = -np.inf, False, 1.0
-        here, likeliest, most, since = figures, figures, -np.inf, 0
-        for k in range(_MAX_PASSES):
+        most, since, most_gained = -np.inf, 0, 1.0
+        for _ in range(_MAX_PASSES):
             used, latest = apply_noise(problem, figures.build_model()), None  # releases the memory of the previous pass
             latest = _smooth_about(used, about.take_first(end))
             done += end
             prior_then = figures.log_prior()
-            now = float(np.sum(latest[0].log_likelihood)) + prior_then
-            if progress is not None:
-                progress("noise", min((k + 1) / rounds, 1.0))
-            here, evidence = figures.copy(), now - _compute_weight_cost(used, figures)
-            likeliest, most, since = (here, evidence, 0) if evidence > most else (likeliest, most, since + 1)
+            evidence = float(np.sum(latest[0].log_likelihood)) + prior_then - _compute_weight_cost(used, figures)
             ahead = _splice(about, latest[1])
             near = are_near(ahead, about, LINEAR_ATTITUDE)
-            about = ahead if near else shorten_step(used, about, ahead)
-            _improve(figures, used, *latest, end, intervals)
-            # each figure gains a half by chance; while one sensor is far off, many passes gain little more than that
-            converged = k > 1 and abs(evidence - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
-            # weights and figures may alternate between two states
-            if converged or since == _ROUNDS // 2:
+            here, about = figures.copy(), ahead if near else shorten_step(used, about, ahead)
+            gained = evidence - most
+            if intervals and INTERVALS[0] not in here.weights:
+                pass  # another model than is asked for
+            elif gained > 0.0:
+                likeliest, most, since = here, evidence, 0
+            else:
+                since += 1
+            expected, information = _improve(figures, used, *latest, end, intervals)
+            if gained < 0.0:
+                _average(problem, figures, here)
+            most_gained = max(most_gained, expected)
+            if progress is not None:
+                progress("noise", 1.0 - np.log1p(expected) / np.log1p(most_gained))
+            converged = near and abs(gained) < _SETTLED * _CHANCE_GAIN * len(figures.log)
+            if converged or since == _UNSETTLED:
                 break
-            before, figures.extrapolation = evidence, _EXTRAPOLATION if k > 1 and evidence > before else 1.0
-        if not converged:  # oscillating, or not yet converged
-            figures = likeliest
-        elif end == total:
-            figures = here
-    if not converged:
+        figures = here if converged and end == total else figures if converged else likeliest
+    if not converged:  # the last pass is not that of the likeliest figures
         latest = None
         used = apply_noise(problem, figures.build_model())
         latest = _smooth_about(used, about)
         done, prior_then = done + total, figures.log_prior()
-        now = float(np.sum(latest[0].log_likelihood)) + prior_then
+        evidence = float(np.sum(latest[0].log_likelihood)) + prior_then - _compute_weight_cost(used, figures)
+        information = _inform(figures, used, *latest, collect_moments(used, latest[0].about.states.R_nb, latest[1]))
     assert latest is not None
-    evidence, passes = now - _compute_weight_cost(used, figures), round(done / total)
-    figures.sigmas = _compute_sigmas(figures, used, *latest)
-    return NoiseEstimate(
-        figures.build_model(), latest[1].drop_rows(), prior_then, evidence, Counter(filter=passes, smoother=passes)
-    )
+    figures.sigmas = figures.compute_sigmas(information)
+    passes = Counter(filter=round(done / total), smoother=round(done / total))
+    return NoiseEstimate(figures.build_model(), latest[1].drop_rows(), prior_then, evidence, passes)
 
 
-def _compute_sigmas(
-    figures: Components, used: Problem, forward: ForwardRecord, smoothed: MomentPass
-) -> dict[str, float]:
-    """1-sigma of every logarithm, whatever the others are."""
-    information = compute_information(used, forward, smoothed, tuple(figures.log))
-    information += np.diag([figures.get_prior(name)[1] ** -2.0 for name in figures.log])
-    return dict(zip(figures.log, np.sqrt(np.diag(np.linalg.inv(information))).tolist(), strict=True))
+def _average(problem: Problem, figures: Components, before: Components) -> None:
+    """Take the figures, and the weights of rows, half way back to others."""
+    for name, x in before.log.items():
+        figures.log[name] = 0.5 * (figures.log[name] + x)
+    for now, then in ((figures.times, before.times), (figures.tails, before.tails)):
+        now.update({name: float(np.sqrt(x * then[name])) for name, x in now.items() if name in then})
+    both = figures.build_model(), before.build_model()
+    for rows in problem.constraints:
+        if rows.name in before.weights and rows.name in figures.weights:
+            t = problem.t[rows.keyframe]
+            one, other = (select_weights(t, noise, rows.name) for noise in both)
+            figures.weights[rows.name] = list_reduced(t, np.sqrt(one * other), one > 0.0)
+
+
+def _inform(
+    figures: Components, used: Problem, forward: ForwardRecord, smoothed: MomentPass, moments: Moments
+) -> Array:
+    return compute_information(used, forward, smoothed, moments, tuple(figures.log))
 
 
 def _compute_weight_cost(used: Problem, figures: Components) -> float:
@@ -226,10 +230,19 @@ def _splice(about: Points, part: Points) -> Points:
     return Points(states, np.concatenate([part.values, about.values[n:]]))
 
 
-def _bound_squares(A: Array, B: Array, freedom: int) -> tuple[float, float]:
-    """Sums of bounded squares and of redundancies; the bound's effect on the mean is compensated."""
+def _sum(A: Array, B: Array) -> Squares:
+    """Sums of squares A and redundancies B of the same shape, each of one degree of freedom."""
+    return Squares(float(np.sum(A)), float(np.sum(B)), float(np.sum(B * B)))
+
+
+def _sum_bounded(A: Array, B: Array, freedom: int, each: Array | float = 1.0) -> Squares:
+    """Sums of squares A (n,) and redundancies B (n,), of `each` degrees of freedom in the data, `freedom` by nature.
+
+    Squares are bounded, if that makes their sum smaller: the bound's effect on the mean is compensated.
+    """
     most, mean = float(chdtri(freedom, CHANCE)), compute_bounded_mean(freedom)
-    return float(np.sum(np.minimum(A, most / freedom * B))) * freedom / mean, float(np.sum(B))
+    bounded = float(np.sum(np.minimum(A, most / freedom * B))) * freedom / mean
+    return Squares(min(float(np.sum(A)), bounded), float(np.sum(B)), float(np.sum(B * B / each)))
 
 
 def _improve(
@@ -239,36 +252,43 @@ def _improve(
     smoothed: MomentPass,
     end: int,
     intervals: bool,
-) -> None:
-    """One step for all figures and weights."""
-    imu = collect_imu_moments(problem, forward.about.states.R_nb[:-1], smoothed)
+) -> tuple[float, Array]:
+    """One step for all figures and weights; the gain that is expected of it, and the information on the figures."""
+    moments = collect_moments(problem, forward.about.states.R_nb, smoothed)
+    squares, before = defaultdict[str, Squares](Squares), dict(figures.log)
     for i, name in enumerate(NOISE_FIGURES):
-        figures.update(f"imu.{name}", *_bound_squares(imu.A[:, i], imu.B[:, i], 3))
-    if intervals:
-        _weigh_intervals(figures, problem, imu)
-    driven: dict[str, tuple[Array, Array, Array]] = {}
+        squares[f"imu.{name}"] = _sum_bounded(moments.imu.A[:, i], moments.imu.B[:, i], 3, moments.imu.freedom[:, i])
     for chain in problem.chains:
-        if chain.parameter.noise_groups:
-            driven[chain.parameter.name] = collect_process_moments(problem, chain, smoothed, end)
-            _improve_process(figures, chain, driven[chain.parameter.name])
-            observed = _is_observed(figures, chain)
-            if chain.parameter.correlation_time is not None and observed.any():
-                _improve_time(figures, chain, observed, lag_moments(problem, chain, smoothed, end))
+        if chain.parameter.name in moments.processes:
+            _, A, B = moments.processes[chain.parameter.name]
+            for own, group in enumerate(chain.parameter.noise_groups):
+                squares[group] += _sum_bounded(A[:, own], B[:, own], 1)
+    components = {}
     for rows in problem.constraints:
-        names, index = rows.list_noise_groups()
-        if not names:
-            continue
-        n = int(np.searchsorted(rows.keyframe, end))
-        found, index = collect_row_moments(problem, rows, smoothed, n), index[:n]
-        grown = np.ones(found.A.shape)
-        for i, name in enumerate(names):
-            own, before = index == i, figures.log[name]
-            if own.any():
-                figures.update(name, float(np.sum(found.A[own])), float(np.sum(found.B[own])))
-            grown[own] = np.exp(figures.log[name] - before)
-        # with the figures of the next pass: B is the share of the row's own variance in that of its prediction
-        squared = found.left_out / np.mean(1.0 + found.B * (grown - 1.0), axis=1)
-        _weigh_rows(figures, problem, rows, squared)
+        if rows.name in moments.rows:
+            found = moments.rows[rows.name]
+            names, index = rows.list_noise_groups()
+            components[rows.name] = names, index[: len(found.A)]
+            for i, name in enumerate(names):
+                own = components[rows.name][1] == i
+                squares[name] += _sum(found.A[own], found.B[own])
+    information = _inform(figures, problem, forward, smoothed, moments)
+    gain = figures.improve(squares, information)
+    if intervals:
+        _weigh_intervals(figures, problem, moments.imu)
+    for chain in problem.chains:
+        if chain.parameter.name in moments.processes and chain.parameter.correlation_time is not None:
+            observed = _is_observed(figures, chain)
+            if observed.any():
+                lags = lag_moments(problem, chain, smoothed, moments.processes[chain.parameter.name])
+                _improve_time(figures, chain, observed, lags)
+    for rows in problem.constraints:
+        if rows.name in moments.rows:
+            found, (names, index) = moments.rows[rows.name], components[rows.name]
+            grown = np.array([*(np.exp(figures.log[name] - before[name]) for name in names), 1.0])[index]
+            # with the figures of the next pass: B is the share of the row's own variance in that of its prediction
+            _weigh_rows(figures, problem, rows, found.left_out / np.mean(1.0 + found.B * (grown - 1.0), axis=1))
+    return gain, information
 
 
 def _weigh_intervals(figures: Components, problem: Problem, imu: ImuMoments) -> None:
@@ -286,14 +306,6 @@ def _weigh_intervals(figures: Components, problem: Problem, imu: ImuMoments) -> 
         figures.weights[name] = RowWeights(t[some], 1.0 / more[some])
 
 
-def _improve_process(figures: Components, chain: ParameterChain, moments: tuple[Array, Array, Array]) -> None:
-    _, A, B = moments
-    groups = np.array(chain.parameter.noise_groups)
-    for group in dict.fromkeys(name for name in chain.parameter.noise_groups if name in figures.log):
-        own = groups == group
-        figures.update(group, *_bound_squares(A[:, own], B[:, own], 1))
-
-
 def _is_observed(figures: Components, chain: ParameterChain) -> Array:
     """(k,) whether the data determine the variance of each number of a process."""
     return np.array([figures.freedom.get(group, 0.0) > 1.0 for group in chain.parameter.noise_groups])
@@ -302,32 +314,46 @@ def _is_observed(figures: Components, chain: ParameterChain) -> Array:
 def _improve_time(figures: Components, chain: ParameterChain, observed: Array, lags: tuple[Array, ...]) -> None:
     """One expectation-maximisation step of the correlation time, on a grid, with a log-normal prior.
 
-    `observed` (k,) of its numbers are used.
+    Steady variances follow, so that the driving noise stays: data much shorter than a correlation time determine that
+    alone, and at a given variance the two would go up and down together, in many passes. `observed` (k,) of the
+    process's numbers are used.
     """
     dt, left, later, cross, before = lags
     p = chain.parameter
     assert p.correlation_time is not None
     if not len(dt):
         return
-    pairs, first = np.unique(dt + 1j * left, return_inverse=True)  # few differ; by axis it takes fifteen times as long
+    first, usual = before[0, observed], float(np.median(dt))
+    pairs, inverse = np.unique(dt + 1j * left, return_inverse=True)  # few differ; by axis 15 times as long
     dt, left = pairs.real, pairs.imag
     later, cross, before, count = (
-        np.stack([np.bincount(first, one, len(dt)) for one in some.T[observed]], axis=-1)
+        np.stack([np.bincount(inverse, one, len(dt)) for one in some.T[observed]], axis=-1)
         for some in (later, cross, before, np.ones_like(before))
     )
     times = p.correlation_time * np.exp(_TIME_GRID)
+    grown = np.expm1(-2.0 * usual / p.correlation_time) / np.expm1(-2.0 * usual / times)  # steady variance
+    steady = grown[:, None] * chain.sigma[0, observed] ** 2
     a = (np.exp(-dt[:, None] / times) * left[:, None])[..., None]
-    q = (1.0 - a * a) * chain.sigma[0, observed] ** 2
+    q = (1.0 - a * a) * steady
     squares = later[:, None] - 2.0 * a * cross[:, None] + a * a * before[:, None]
     value = -0.5 * np.sum(count[:, None] * np.log(q) + squares / q, axis=(0, 2))
+    value -= 0.5 * np.sum(np.log(steady) + first / steady, axis=1)
     median = figures.prior_times[p.name]
     value -= 0.5 * (np.log(times / median) / TIME_WITHIN) ** 2
+    groups = {group for group, known in zip(p.noise_groups, observed, strict=True) if known}
+    for group in groups:
+        m, s = figures.get_prior(group)
+        value -= 0.5 * ((figures.log[group] + np.log(grown) - m) / s) ** 2
+    value[(times < median / _TIME_RANGE) | (times > median * _TIME_RANGE)] = -np.inf
     j = int(np.clip(np.argmax(value), 1, len(_TIME_GRID) - 2))
     low, here, high = value[j - 1 : j + 2]
     bend = low - 2.0 * here + high
-    off = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
-    found = p.correlation_time * np.exp(_TIME_GRID[j] + (_TIME_GRID[1] - _TIME_GRID[0]) * np.clip(off, -1.0, 1.0))
-    figures.times[p.name] = float(np.clip(found, median / _TIME_RANGE, median * _TIME_RANGE))
+    off = 0.5 * (low - high) / bend if -np.inf < bend < 0.0 else 0.0
+    x = _TIME_GRID[j] + (_TIME_GRID[1] - _TIME_GRID[0]) * float(np.clip(off, -1.0, 1.0))
+    x = float(np.clip(_RELAXATION * x, _TIME_GRID[0], _TIME_GRID[-1]))
+    figures.times[p.name] = p.correlation_time * float(np.exp(x))
+    for group in groups:
+        figures.log[group] += float(np.interp(x, _TIME_GRID, np.log(grown)))
 
 
 def _weigh_rows(figures: Components, problem: Problem, rows: Constraint, squared: Array) -> None:

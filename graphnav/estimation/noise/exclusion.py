@@ -20,10 +20,9 @@ decides what is left out.
 
 Masking. Figures that are estimated with a fault among the data may have grown until they hide it, so the tests are made
 with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans.
-Unless these explain the rest better than the figures found, beyond chance, nothing was masked. Where an aiding sensor
-is worse than its prior's sigma, that is concluded only if figures estimated from the priors do not either. Each set of
-spans that comes up on the way is decided by these figures, and the decision with the largest evidence stands. All that
-is done once more, as the spans shrink to what is wrong, unless the figures lose more evidence inside them than they
+Unless these explain the rest better than the figures found, beyond chance, nothing was masked. Each set of spans that
+comes up on the way is decided by these figures, and the decision with the largest evidence stands. All that is done
+once more, as the spans shrink to what is wrong, unless the figures lose more evidence inside them than they
 gain outside. If no fault is left, the estimate that uses all measurements and starts from these figures is a candidate.
 
 Segments. A filter follows an error that lasts for more than `watch.PATIENCE`, so the tests find its beginning, and its
@@ -234,14 +233,10 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
     rival, gain = first.rival or first, np.inf  # rival: by other spans than segments
     start = NoiseModel(found.noise.figures, found.noise.times, excluded=dict.fromkeys(FIXES, tuple(masked)))
     for _ in range(_REFINEMENTS):
-        estimate = estimate_noise(base, None, start, estimate.get_linearisation(base), changed=True)
+        estimate = estimate_noise(base, None, start, estimate.get_linearisation(base))
         if spans is masked and np.isfinite(first.log_evidence):
             gain = estimate.log_evidence - weigh_rest(base, found, estimate.noise.excluded)
             passes = passes + Counter(filter=1)
-            if gain <= estimate.gained_by_chance and found.excess > 1.0:  # no step may lead from there to the optimum
-                passes, start = passes + estimate.passes + Counter(filter=1), NoiseModel(excluded=start.excluded)
-                estimate = estimate_noise(base, None, start, estimate.get_linearisation(base))
-                gain = estimate.log_evidence - weigh_rest(base, found, estimate.noise.excluded)
             if gain <= estimate.gained_by_chance:
                 return _use_all(base, first, estimate, passes + estimate.passes)
         used = apply_noise(base, estimate.noise)

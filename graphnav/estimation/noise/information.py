@@ -22,42 +22,44 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
-from graphnav.estimation.noise.moments import collect_imu_moments, collect_row_moments
+from graphnav.estimation.noise.moments import Moments
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.disturbance import compare_disturbances
-from graphnav.estimation.solvers.linearise import find_stepping, shift
+from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.passes import ForwardRecord, MomentPass
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 
-def compute_information(problem: Problem, forward: ForwardRecord, smoothed: MomentPass, names: Sequence[str]) -> Array:
+def compute_information(
+    problem: Problem, forward: ForwardRecord, smoothed: MomentPass, moments: Moments, names: Sequence[str]
+) -> Array:
     """The average information (J, J) on the logarithms of variance components.
 
     Parameters
     ----------
-    forward : linearised at given points throughout, of all keyframes, and `smoothed` by it.
+    forward : linearised at given points throughout, and `smoothed` by it.
+    moments : of `smoothed`.
     names : of the J components, those of the IMU first.
     """
     updates, number = forward.updates, {name: j for j, name in enumerate(names)}
     assert updates is not None
     n, M, D = updates.H.shape
-    attitudes = forward.about.states.R_nb[: n - 1]
-    common = np.zeros((n, DIM, len(NOISE_FIGURES)))
-    disturbance = collect_imu_moments(problem, attitudes, smoothed).disturbance
-    common[1:] = problem.motion.compute_frames(slice(0, n - 1), attitudes) @ np.swapaxes(disturbance, 1, 2)
+    attitudes, common = forward.about.states.R_nb[: n - 1], np.zeros((n, DIM, len(NOISE_FIGURES)))
+    common[1:] = problem.motion.compute_frames(slice(0, n - 1), attitudes) @ np.swapaxes(moments.imu.disturbance, 1, 2)
     driven, of_driven = np.zeros((n, D - DIM)), np.full(D - DIM, -1)
     for chain in problem.chains:
         if chain.parameter.noise_groups:
-            at, k = problem.columns[chain.parameter.name], np.append(0, find_stepping(chain, n))
+            at, k = problem.columns[chain.parameter.name], moments.processes[chain.parameter.name][0]
             driven[k, shift(at)] = chain.sigma[chain.node[k]] ** 2 * smoothed.r[k, at]
             of_driven[shift(at)] = [number.get(group, -1) for group in chain.parameter.noise_groups]
     errors, of_errors = np.zeros((n, M)), np.full((n, M), -1)
     for rows in problem.constraints:
         groups, index = rows.list_noise_groups()
         if groups:
-            k, place = updates.places[rows.name]
-            errors[k, place] = -collect_row_moments(problem, rows, smoothed, len(rows)).error
-            of_errors[k, place] = np.array([*(number.get(group, -1) for group in groups), -1])[index]
+            found = moments.rows[rows.name].error
+            k, place = (one[: len(found)] for one in updates.places[rows.name])
+            errors[k, place] = -found
+            of_errors[k, place] = np.array([*(number.get(group, -1) for group in groups), -1])[index[: len(found)]]
     out = np.zeros((len(names), len(names)))
     compare_disturbances(
         (forward.F, forward.decay), updates.arrays, updates.blocks.arrays, common, driven, of_driven, errors,

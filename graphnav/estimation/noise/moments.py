@@ -33,6 +33,8 @@ from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Rows, find_stepping, shift
 from graphnav.estimation.solvers.passes import MomentPass, SmootherPass
 
+Process = tuple[Array, Array, Array]  # keyframes (n,), A and B (n, k)
+
 _FORGOTTEN = 1e-6  # relative remainder of a difference below which it is rounding error
 
 
@@ -71,6 +73,31 @@ class ImuMoments:
         return np.maximum(freedom, 1.0)
 
 
+@dataclass(frozen=True)
+class Moments:
+    """Of all variance components, over the first keyframes of a problem."""
+
+    imu: ImuMoments
+    processes: dict[str, Process]  # by parameter
+    rows: dict[str, RowMoments]  # by constraint
+
+
+def collect_moments(problem: Problem, attitudes: Array, smoothed: MomentPass) -> Moments:
+    """Of all components over the keyframes of a smoothed solution, with the attitudes R_nb (n, 3, 3) it is about."""
+    n = len(attitudes)
+    chains = [chain for chain in problem.chains if chain.parameter.noise_groups]
+    grouped = [rows for rows in problem.constraints if rows.list_noise_groups()[0]]
+    counts = [int(np.searchsorted(rows.keyframe, n)) for rows in grouped]
+    return Moments(
+        collect_imu_moments(problem, attitudes[:-1], smoothed),
+        {chain.parameter.name: collect_process_moments(problem, chain, smoothed, n) for chain in chains},
+        {
+            rows.name: collect_row_moments(problem, rows, smoothed, count)
+            for rows, count in zip(grouped, counts, strict=True)
+        },
+    )
+
+
 def collect_imu_moments(problem: Problem, start: Array, smoothed: MomentPass) -> ImuMoments:
     """Moments of the intervals, by the attitudes R_nb (n, 3, 3) at their starts.
 
@@ -100,9 +127,7 @@ def sum_parts(Q: Array, r: Array, N: Array) -> tuple[Array, Array]:
     return Qr, B
 
 
-def collect_process_moments(
-    problem: Problem, chain: ParameterChain, smoothed: MomentPass, end: int
-) -> tuple[Array, Array, Array]:
+def collect_process_moments(problem: Problem, chain: ParameterChain, smoothed: MomentPass, end: int) -> Process:
     """Keyframes (n,) at which a process is driven, and A and B (n, k) there; the first is its steady variance."""
     at = problem.columns[chain.parameter.name]
     k = np.concatenate([[0], find_stepping(chain, end)])
@@ -141,7 +166,7 @@ def collect_row_moments(problem: Problem, rows: Constraint, smoothed: MomentPass
     return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, share * linear.residual)
 
 
-def lag_moments(problem: Problem, chain: ParameterChain, smoothed: MomentPass, end: int) -> tuple[Array, ...]:
+def lag_moments(problem: Problem, chain: ParameterChain, smoothed: MomentPass, moments: Process) -> tuple[Array, ...]:
     """Of a process, from node to node: times between (n,), the correlation (n,) that a change of its size leaves, and
     E[c' c'], E[c' c] and E[c c] (n, k), c' the later.
 
@@ -150,7 +175,7 @@ def lag_moments(problem: Problem, chain: ParameterChain, smoothed: MomentPass, e
     """
     at = problem.columns[chain.parameter.name]
     own = shift(at)
-    k, A, B = collect_process_moments(problem, chain, smoothed, end)
+    k, A, B = moments
     k, j = k[1:], chain.node[k[1:]]
     driven = chain.sigma[j] ** 2 * (1.0 + A[1:] - B[1:])
     c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
