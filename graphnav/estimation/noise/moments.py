@@ -35,6 +35,7 @@ from graphnav.estimation.solvers.passes import MomentPass, SmootherPass
 
 Process = tuple[Array, Array, Array]  # keyframes (n,), A and B (n, k)
 
+_CONTROLLED = 0.01  # redundancy below which nothing can tell whether a row is wrong (Foerstner's limit)
 _FORGOTTEN = 1e-6  # relative remainder of a difference below which it is rounding error
 
 
@@ -157,7 +158,7 @@ def collect_row_moments(problem: Problem, rows: Constraint, smoothed: MomentPass
     w, B = _compute_redundancies(linear, HPH)
     # in axes that diagonalise the whitened covariance: a stamp error affects all components together
     each, axes = np.linalg.eigh(HPH / (linear.stated[:, :, None] * linear.stated[:, None]))
-    free = np.clip(1.0 - w * each, 1e-6, 1.0)
+    free = np.clip(1.0 - w * each, _CONTROLLED, 1.0)
     predicted = np.einsum("nji,nj->ni", axes, linear.residual / linear.stated) / free
     left_out = np.sum(predicted**2 / (1.0 + np.maximum(each, 0.0) / free), axis=1)
     # of the component that a factor scales
