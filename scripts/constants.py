@@ -73,8 +73,9 @@ CONSTANTS = (
         2.0,
         whole=True,
     ),
-    Constant(f"{NOISE}.estimate", "_ROUNDS", "computing: passes that are made in any case", 2.0, whole=True),
-    Constant(f"{NOISE}.estimate", "_EXTRAPOLATION", "computing: how far a step is extrapolated"),
+    Constant(f"{NOISE}.moments", "_CONTROLLED", "least redundancy that controls a row (Foerstner)", 3.0),
+    Constant(f"{NOISE}.estimate", "_SETTLED", "computing: gain of a pass at convergence", 3.0),
+    Constant(f"{NOISE}.estimate", "_RELAXATION", "computing: steps of correlation times", 1.3),
     Constant(
         f"{NOISE}.initial_points", "_COOLING", "computing: by how much the sigmas of an annealing fall in a round"
     ),
