@@ -18,7 +18,7 @@ from graphnav.estimation.problem import build_problem
 
 
 def test_a_motorbike_that_leans_is_believed(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Begun as stated, the constraints stay ten times as tight, at an optimum that is 77 nats less likely."""
+    """Begun as stated, the constraints lead to an optimum that is less likely by more than chance."""
     recording, settings = load(shared_data / "motorbike_dresden_20160809"), Settings()
     frame, stops = LocalFrame(choose_origin(recording), recording.start), detect(recording, settings).stationary
     aligned = align(recording, settings, frame, stops)
@@ -27,4 +27,3 @@ def test_a_motorbike_that_leans_is_believed(shared_data: Path, monkeypatch: pyte
     monkeypatch.setattr(Components, "doubt_wheels", lambda *_: None)
     tight = estimate_noise(base, aligned.until)
     assert loose.log_evidence > tight.log_evidence + 2.0 * loose.gained_by_chance
-    assert loose.noise.figures["nhc.up"].factor > 1.0 > 10.0 * tight.noise.figures["nhc.up"].factor

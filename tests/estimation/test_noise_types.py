@@ -115,7 +115,8 @@ def test_errors_of_one_type_that_last(lasting: tuple[Trajectory, dict[str, Solut
     noise = solutions["rts"].noise
     assert 0.8 < times(noise, "gnss_position.fixed.horizontal") < 1.2
     assert 2.0 < whole(noise, "gnss_position.single", "horizontal") < 3.8  # true: 2.7
-    assert 3.0 < noise.times["gnss_error_of_seconds_single"] < 15.0
+    # drawn with 10 s; the errors themselves are likeliest with 16 s, and by 1.8 nats less so with 10 s
+    assert 8.0 < noise.times["gnss_error_of_seconds_single"] < 30.0
     found = {name: rms_and_nees(s.trajectory(), truth) for name, s in solutions.items()}
     assert all(nees < 1.6 for _, nees in found.values()), found
     assert found["rts"][0] < 0.04  # 0.055 with one factor for all
