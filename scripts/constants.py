@@ -74,6 +74,7 @@ CONSTANTS = (
         whole=True,
     ),
     Constant(f"{NOISE}.moments", "_CONTROLLED", "least redundancy that controls a row (Foerstner)", 3.0),
+    Constant(f"{NOISE}.components", "_LONGEST", "computing: longest step of a logarithm", 1.5),
     Constant(f"{NOISE}.estimate", "_SETTLED", "computing: gain of a pass at convergence", 3.0),
     Constant(f"{NOISE}.estimate", "_RELAXATION", "computing: steps of correlation times", 1.3),
     Constant(

@@ -120,9 +120,8 @@ class Components:
         for name, j in place.items():
             m, s = self.get_prior(name)
             off[j], weight[j] = self.log[name] - m, s**-2.0
-            white = _get_white(name)
-            if m != get_prior(name)[0]:
-                L[j, place[white]] = -1.0
+            if m != get_prior(name)[0]:  # it goes with the white part
+                L[j, place[_get_white(name)]] = -1.0
         return -L.T @ (weight * off), L.T @ (weight[:, None] * L)
 
     def compute_sigmas(self, information: Array) -> dict[str, float]:

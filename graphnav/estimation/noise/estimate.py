@@ -152,7 +152,7 @@ def _iterate(
     long = total > 2 * _FIRST_KEYFRAMES and not figures.known
     latest: tuple[ForwardRecord, MomentPass] | None = None
     for end in (_FIRST_KEYFRAMES, total) if long else (total,):
-        most, since, most_gained = -np.inf, 0, 1.0
+        likeliest, most, since, most_expected = figures.copy(), -np.inf, 0, 1.0
         for _ in range(_MAX_PASSES):
             used, latest = apply_noise(problem, figures.build_model()), None  # releases the memory of the previous pass
             latest = _smooth_about(used, about.take_first(end))
@@ -169,12 +169,13 @@ def _iterate(
                 likeliest, most, since = here, evidence, 0
             else:
                 since += 1
-            expected, information = _improve(figures, used, *latest, end, intervals)
+            moments, information = _collect(figures, used, *latest)
+            expected = _improve(figures, used, latest[1], moments, information, intervals)
             if gained < 0.0:
                 _average(problem, figures, here)
-            most_gained = max(most_gained, expected)
+            most_expected = max(most_expected, expected)
             if progress is not None:
-                progress("noise", 1.0 - np.log1p(expected) / np.log1p(most_gained))
+                progress("noise", 1.0 - np.log1p(expected) / np.log1p(most_expected))
             converged = near and abs(gained) < _SETTLED * _CHANCE_GAIN * len(figures.log)
             if converged or since == _UNSETTLED:
                 break
@@ -185,7 +186,7 @@ def _iterate(
         latest = _smooth_about(used, about)
         done, prior_then = done + total, figures.log_prior()
         evidence = float(np.sum(latest[0].log_likelihood)) + prior_then - _compute_weight_cost(used, figures)
-        information = _inform(figures, used, *latest, collect_moments(used, latest[0].about.states.R_nb, latest[1]))
+        information = _collect(figures, used, *latest)[1]
     assert latest is not None
     figures.sigmas = figures.compute_sigmas(information)
     passes = Counter(filter=round(done / total), smoother=round(done / total))
@@ -206,10 +207,10 @@ def _average(problem: Problem, figures: Components, before: Components) -> None:
             figures.weights[rows.name] = list_reduced(t, np.sqrt(one * other), one > 0.0)
 
 
-def _inform(
-    figures: Components, used: Problem, forward: ForwardRecord, smoothed: MomentPass, moments: Moments
-) -> Array:
-    return compute_information(used, forward, smoothed, moments, tuple(figures.log))
+def _collect(figures: Components, used: Problem, forward: ForwardRecord, smoothed: MomentPass) -> tuple[Moments, Array]:
+    """The moments of a pass, and its information on all figures."""
+    moments = collect_moments(used, forward.about.states.R_nb, smoothed)
+    return moments, compute_information(used, forward, smoothed, moments, tuple(figures.log))
 
 
 def _compute_weight_cost(used: Problem, figures: Components) -> float:
@@ -245,35 +246,36 @@ def _sum_bounded(A: Array, B: Array, freedom: int, each: Array | float = 1.0) ->
     return Squares(min(float(np.sum(A)), bounded), float(np.sum(B)), float(np.sum(B * B / each)))
 
 
-def _improve(
-    figures: Components,
-    problem: Problem,
-    forward: ForwardRecord,
-    smoothed: MomentPass,
-    end: int,
-    intervals: bool,
-) -> tuple[float, Array]:
-    """One step for all figures and weights; the gain that is expected of it, and the information on the figures."""
-    moments = collect_moments(problem, forward.about.states.R_nb, smoothed)
-    squares, before = defaultdict[str, Squares](Squares), dict(figures.log)
+def _sum_squares(problem: Problem, moments: Moments) -> dict[str, Squares]:
+    """Of every component."""
+    squares = defaultdict[str, Squares](Squares)
     for i, name in enumerate(NOISE_FIGURES):
         squares[f"imu.{name}"] = _sum_bounded(moments.imu.A[:, i], moments.imu.B[:, i], 3, moments.imu.freedom[:, i])
     for chain in problem.chains:
         if chain.parameter.name in moments.processes:
             _, A, B = moments.processes[chain.parameter.name]
-            for own, group in enumerate(chain.parameter.noise_groups):
-                squares[group] += _sum_bounded(A[:, own], B[:, own], 1)
-    components = {}
+            for i, name in enumerate(chain.parameter.noise_groups):
+                squares[name] += _sum_bounded(A[:, i], B[:, i], 1)
     for rows in problem.constraints:
         if rows.name in moments.rows:
-            found = moments.rows[rows.name]
-            names, index = rows.list_noise_groups()
-            components[rows.name] = names, index[: len(found.A)]
+            found, (names, index) = moments.rows[rows.name], rows.list_noise_groups()
             for i, name in enumerate(names):
-                own = components[rows.name][1] == i
+                own = index[: len(found.A)] == i
                 squares[name] += _sum(found.A[own], found.B[own])
-    information = _inform(figures, problem, forward, smoothed, moments)
-    gain = figures.improve(squares, information)
+    return squares
+
+
+def _improve(
+    figures: Components,
+    problem: Problem,
+    smoothed: MomentPass,
+    moments: Moments,
+    information: Array,
+    intervals: bool,
+) -> float:
+    """One step for all figures and weights; the gain that is expected of it."""
+    before = dict(figures.log)
+    gain = figures.improve(_sum_squares(problem, moments), information)
     if intervals:
         _weigh_intervals(figures, problem, moments.imu)
     for chain in problem.chains:
@@ -284,11 +286,13 @@ def _improve(
                 _improve_time(figures, chain, observed, lags)
     for rows in problem.constraints:
         if rows.name in moments.rows:
-            found, (names, index) = moments.rows[rows.name], components[rows.name]
-            grown = np.array([*(np.exp(figures.log[name] - before[name]) for name in names), 1.0])[index]
+            found, (names, index) = moments.rows[rows.name], rows.list_noise_groups()
+            grown = np.array([*(np.exp(figures.log[name] - before[name]) for name in names), 1.0])[
+                index[: len(found.A)]
+            ]
             # with the figures of the next pass: B is the share of the row's own variance in that of its prediction
             _weigh_rows(figures, problem, rows, found.left_out / np.mean(1.0 + found.B * (grown - 1.0), axis=1))
-    return gain, information
+    return gain
 
 
 def _weigh_intervals(figures: Components, problem: Problem, imu: ImuMoments) -> None:
