@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import oracle
 import pytest
 from scipy.special import chdtrc, chdtri
 
+from graphnav import load
 from graphnav.config import Settings, parse_settings
 from graphnav.config.gnss import GnssSettings
 from graphnav.constraints.base import Constraint
@@ -26,6 +28,7 @@ from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.names import name_components
 from graphnav.estimation.noise import estimate
 from graphnav.estimation.noise.apply import apply_noise, drop_parts, select_weights
+from graphnav.estimation.noise.components import begin_components
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, WHEELS
 from graphnav.estimation.noise.information import compute_information
@@ -38,7 +41,7 @@ from graphnav.estimation.noise.moments import (
     collect_row_moments,
     lag_moments,
 )
-from graphnav.estimation.noise.outliers import may_pay
+from graphnav.estimation.noise.outliers import compute_row_costs, may_pay
 from graphnav.estimation.noise.priors import get_prior
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_far
@@ -54,6 +57,7 @@ from graphnav.imu.dynamics import SCALE
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.recording import Recording
 
+TOKYO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
 # Wheels and stops hold exactly on these drives, which no sigma is made for
 INERTIAL = parse_settings(
     {
@@ -177,6 +181,28 @@ def test_information_is_the_derivative_of_the_squares() -> None:
         slope[j] -= A[j]
         off = np.abs(found[j] + 0.25 * slope) / np.sqrt(found[j, j] * np.diag(found))
         assert np.max(off) < 2e-3, name
+
+
+def test_estimates_end_where_the_posterior_is_level() -> None:
+    """Its slope by each figure, by central differences: less than two of the figure's sigmas from the optimum."""
+    base, opening = built(load(TOKYO).crop(0.0, 200.0))
+    found = estimate_noise(base, opening)
+    about = found.carry_points(base, apply_noise(base, found.noise))
+
+    def log_posterior(noise: NoiseModel) -> float:
+        used = apply_noise(base, noise)
+        likelihood = (
+            refilter(used, about, whole=False).log_likelihood.sum() - compute_row_costs(used, noise.tails).sum()
+        )
+        return float(likelihood) + begin_components(base, noise).log_prior()
+
+    for name, figure in found.noise.figures.items():
+        h = 0.1 * figure.sigma
+        both = []
+        for step in (-h, h):
+            other = {**found.noise.figures, name: replace(figure, log_factor=figure.log_factor + step)}
+            both.append(log_posterior(replace(found.noise, figures=other)))
+        assert abs(both[1] - both[0]) / (2.0 * h) * figure.sigma < 2.0, name
 
 
 def mixed(base: Problem, opening: float | None) -> tuple[Problem, NoiseModel, SmootherPass]:
