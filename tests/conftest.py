@@ -11,6 +11,11 @@ import pytest
 # programs that tests start keep their bytecode: without it each takes three times as long until it runs
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+# a worker has a processor of its own: where each has two, second processes are begun that only wait for the others
+if (worker := os.environ.get("PYTEST_XDIST_WORKER", "")) and hasattr(os, "sched_setaffinity"):
+    processors = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {processors[int(worker.removeprefix("gw")) % len(processors)]})
+
 # what is imported and kept for many tests is no garbage, and looking through it every 700 objects costs a few per cent
 gc.set_threshold(50_000, 20, 50)
 

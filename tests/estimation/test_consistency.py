@@ -127,7 +127,7 @@ def test_with_positions_and_velocities(velocities: dict[str, Score], solver: str
 @pytest.fixture(scope="module")
 def towns() -> list[tuple[Simulated, dict[str, Solution]]]:
     """Simulated drives through a town, and the smoother's solutions."""
-    drives = [simulate("electric", seed, duration=300.0, tunnels=0) for seed in range(TOWNS)]
+    drives = [simulate("electric", seed, duration=300.0, tunnels=0, rate=50.0) for seed in range(TOWNS)]
     return [(one, run(one.recording, solvers="rts")) for one in drives]
 
 

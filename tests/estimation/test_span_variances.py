@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from helpers import forget_residuals
 
 from graphnav import load
 from graphnav.app.scores import score
-from graphnav.config import parse_settings
+from graphnav.config import Settings, parse_settings
 from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.noise.span_variances import count_repetition
@@ -66,43 +66,49 @@ def test_a_filter_does_not_drift_where_fixes_are_wrong(
     assert found["nees_p"] < 2.0 < plain["nees_p"]
 
 
-def test_the_weights_are_part_of_the_noise_model(shared_data: Path, tmp_path: Path) -> None:
-    recording = displace_a_minute(load(shared_data / "tokyo_20201105").crop(600.0, 900.0))
-    settings = parse_settings({"gnss": {"velocity": False}})
-    solutions = run(recording, settings, ("rts",))
-    noise = solutions["rts"].noise
-    decided = [
-        span for span in solutions["rts"].excluded if span.kind in noise.span_weights and span.sigma_factor < np.inf
-    ]
+@dataclass(frozen=True)
+class Displaced:
+    """A drive, the same with a minute of fixes 20 m farther north, and what that is solved as."""
+
+    clean: Recording
+    damaged: Recording
+    settings: Settings
+    solutions: dict[str, Solution]
+
+
+@pytest.fixture(scope="module")
+def displaced(shared_data: Path) -> Displaced:
+    clean = load(shared_data / "tokyo_20201105").crop(680.0, 860.0)
+    gnss = clean.gnss
+    assert gnss is not None
+    llh = gnss.llh.copy()
+    llh[(gnss.t > clean.start + 70.0) & (gnss.t < clean.start + 130.0), 0] += 20.0 / 6.37e6
+    damaged, settings = replace(clean, gnss=replace(gnss, llh=llh)), parse_settings({"gnss": {"velocity": False}})
+    return Displaced(clean, damaged, settings, run(damaged, settings, ("ekf", "rts")))
+
+
+def test_the_weights_are_part_of_the_noise_model(displaced: Displaced, tmp_path: Path) -> None:
+    found = displaced.solutions["rts"]
+    noise = found.noise
+    decided = [span for span in found.excluded if span.kind in noise.span_weights and span.sigma_factor < np.inf]
     assert sum(span.count for span in decided) > 30
     for span in decided:
         t = np.array([span.t_start, span.t_end])
         np.testing.assert_allclose(select_weights(t, noise, span.kind), span.sigma_factor**-2.0)
         assert 1.0 < span.sigma_factor < np.inf
     kept = read_noise(write_noise(tmp_path / "noise.json", noise))
-    again = run(recording, settings, ("rts",), noise=kept)["rts"]
-    np.testing.assert_array_equal(again.states.p, solutions["rts"].states.p)
-    assert again.excluded == solutions["rts"].excluded
+    again = run(displaced.damaged, displaced.settings, ("rts",), noise=kept)["rts"]
+    np.testing.assert_array_equal(again.states.p, found.states.p)
+    assert again.excluded == found.excluded
 
 
-def displace_a_minute(clean: Recording) -> Recording:
-    """A minute of fixes 20 m farther north."""
-    gnss = clean.gnss
-    assert gnss is not None
-    llh = gnss.llh.copy()
-    llh[(gnss.t > clean.start + 150.0) & (gnss.t < clean.start + 210.0), 0] += 20.0 / 6.37e6
-    return replace(clean, gnss=replace(gnss, llh=llh))
-
-
-def test_fixes_displaced_together_do_no_harm(shared_data: Path) -> None:
+def test_fixes_displaced_together_do_no_harm(displaced: Displaced) -> None:
     """A minute of good fixes displaced by 20 m: as good as without them, which a drive with wheels can do without."""
-    clean = load(shared_data / "tokyo_20201105").crop(600.0, 900.0)
-    damaged, settings = displace_a_minute(clean), parse_settings({"gnss": {"velocity": False}})
-    used = run(damaged, settings, ("ekf", "rts"))
-    without = run(damaged, settings, ("ekf", "rts"), noise=replace(used["rts"].noise, span_weights={}))
+    used, damaged = displaced.solutions, displaced.damaged
+    without = run(damaged, displaced.settings, ("ekf", "rts"), noise=replace(used["rts"].noise, span_weights={}))
     (span,) = [one for one in used["rts"].excluded if one.count > 30]
     sigma = span.sigma_factor * float(np.median(used["rts"].records["gnss_position"].sigma))
     assert sigma > 20.0 * np.sqrt(0.5 * span.count)
     for name in ("ekf", "rts"):
-        rms = [summarise(score(clean, damaged, x, ())[0][name])["h_rms_m"] for x in (used, without)]
+        rms = [summarise(score(displaced.clean, damaged, x, ())[0][name])["h_rms_m"] for x in (used, without)]
         assert rms[0] < 1.02 * rms[1], name

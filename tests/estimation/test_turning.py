@@ -117,8 +117,8 @@ def test_a_message_that_knows_no_heading_learns_none_where_its_point_moves(moves
 
 @pytest.fixture(scope="module")
 def walk() -> Online:
-    """A minute and more of a walk without fixes, none of which has settled."""
-    recording = simulate("gait", 1, duration=60.0, rate=100.0).recording
+    """Three quarters of a minute of a walk without fixes, none of which has settled."""
+    recording = simulate("gait", 1, duration=45.0, rate=100.0).recording
     online = Online(drop_rows(recording))
     for row in list_rows(recording)[1]:
         online.add(row)

@@ -30,7 +30,7 @@ __all__ = ["built", "drive"]  # fixtures
 @pytest.fixture(scope="module")
 def live(drive: tuple[Recording, Trajectory]) -> tuple[Recording, Trajectory]:
     """As much of it as holds a burst, with half the rows of its IMU."""
-    return at_rate(drive[0].crop(0.0, 190.0), 25.0), drive[1]
+    return at_rate(drive[0].crop(0.0, 160.0), 25.0), drive[1]
 
 
 def likelihoods(slots: watch._Slots) -> Array:
@@ -125,10 +125,10 @@ def test_as_it_drives_an_error_that_grows_is_found(drive: tuple[Recording, Traje
 
 
 def test_as_it_drives_noise_is_weighed_down(drive: tuple[Recording, Trajectory]) -> None:
-    """A minute and a half of fixes that scatter ten times as much as they state."""
-    recording = at_rate(drive[0].crop(0.0, 240.0), 25.0)
+    """A minute of fixes that scatter ten times as much as they state."""
+    recording = at_rate(drive[0].crop(0.0, 210.0), 25.0)
     t = recording.gnss.t - recording.start
-    bad = (t >= 110.0) & (t < 200.0)
+    bad = (t >= 110.0) & (t < 170.0)
     noisy = scattered(recording, bad, 10.0, 3)
 
     def rms(mode: str) -> float:

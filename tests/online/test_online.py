@@ -882,14 +882,13 @@ def test_a_lever_arm_that_the_drive_contradicts_is_found_while_it_lasts(engine: 
     assert "gnss.lever_arm_used" in map(get_key, online.notes)
 
 
-@pytest.mark.parametrize("engine", ["window", "isam2"])
-def test_an_odometer_whose_readings_are_late_is_waited_for(engine: str) -> None:
+def test_an_odometer_whose_readings_are_late_is_waited_for() -> None:
     """A keyframe is solved with the readings that came later than it by as much as they are late."""
     late, path = 0.3, oracle.vehicle_path(150.0, 25.0)
     recording, truth = oracle.drive(path, seed=6, odometer_rate=20.0)
     assert recording.odometer is not None
     wrong = replace(recording, odometer=replace(recording.odometer, t=recording.odometer.t + late))
-    online, parts = Online(drop_rows(wrong), parse_settings({"solver": {"lag": 20.0, "engine": engine}})), []
+    online, parts = Online(drop_rows(wrong), parse_settings({"solver": {"lag": 20.0}})), []
     for row in list_rows(wrong)[1]:
         online.add(row)
         parts += online.settled()

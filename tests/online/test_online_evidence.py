@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import at_rate
 
 from graphnav import load
 from graphnav.config import parse_settings
@@ -87,7 +88,7 @@ def play(recording: Recording) -> Online:
 @pytest.fixture
 def recording(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> Recording:
     monkeypatch.setattr(smoother, "are_enough", lambda *_: True)
-    return load(shared_data / "oracle_drive").crop(50.0, 230.0)
+    return at_rate(load(shared_data / "oracle_drive").crop(50.0, 230.0), 25.0)
 
 
 def test_right_fixes_that_tests_leave_out_are_used_before_anything_settles_without_them(

@@ -7,7 +7,9 @@ import json
 import os
 import pickle
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -49,14 +51,20 @@ def plain(drive: tuple[Recording, Trajectory], rows: list[Row]) -> Trajectory:
     return played(drive[0], rows, QUICK)[1]
 
 
+Stepped = tuple[list[Row], list[Row], Online, Trajectory]
+
+
 @pytest.fixture(scope="module")
-def stepped(
-    request: pytest.FixtureRequest, drive: tuple[Recording, Trajectory], rows: list[Row]
-) -> tuple[list[Row], list[Row], Online, Trajectory]:
-    """Rows before a step of the clock, all of them with those behind it, and what becomes of them."""
-    old = [row for row in rows if row[1] <= 41.9]
-    sent = [*old, *((name, t + request.param, values) for name, t, values in rows if t > 41.9)]
-    return old, sent, *played(drive[0], sent, QUICK)
+def stepped(drive: tuple[Recording, Trajectory], rows: list[Row]) -> Callable[[float], Stepped]:
+    """Rows before a step of the clock (s), all of them with those behind it, and what becomes of them."""
+
+    @cache
+    def step(by: float) -> Stepped:
+        old = [row for row in rows if row[1] <= 41.9]
+        sent = [*old, *((name, t + by, values) for name, t, values in rows if t > 41.9)]
+        return old, sent, *played(drive[0], sent, QUICK)
+
+    return step
 
 
 def between(rows: list[Row], more: list[Row]) -> list[Row]:
@@ -199,7 +207,7 @@ def test_a_fix_before_the_first_imu_row_of_another_clock_counts(
 
 
 @pytest.mark.parametrize(
-    ("stepped", "sensor", "which"),
+    ("step", "sensor", "which"),
     [
         (-1000.0, "imu", -1),
         (-1000.0, "imu", 0),
@@ -207,16 +215,16 @@ def test_a_fix_before_the_first_imu_row_of_another_clock_counts(
         (3600.0, "imu", -3),
         (3600.0, "gnss", 0),
     ],
-    indirect=["stepped"],
 )
 def test_a_row_that_comes_late_over_a_step_of_the_clock_counts(
     drive: tuple[Recording, Trajectory],
-    stepped: tuple[list[Row], list[Row], Online, Trajectory],
+    stepped: Callable[[float], Stepped],
+    step: float,
     sensor: str,
     which: int,
 ) -> None:
     """By a second, from before the step or from behind it: each piece is as if it had come in its turn."""
-    old, sent, plain, other = stepped
+    old, sent, plain, other = stepped(step)
     numbers = range(len(old)) if which < 0 else range(len(old), len(sent))
     k = [n for n in numbers if sent[n][0] == sensor][which]
     late = [*sent[:k], *sent[k + 1 : k + 25], sent[k], *sent[k + 25 :]]
