@@ -53,7 +53,7 @@ def play_window(problem: Problem, lag: float = np.inf, progress: Progress | None
 
 def play_isam2(problem: Problem, lag: float = np.inf, progress: Progress | None = None) -> Replay:
     """By GTSAM's iSAM2."""
-    return _play(problem, "isam2", TreeWindow(*_begin(problem), whole=bool(np.isinf(lag))), lag, progress)
+    return _play(problem, "isam2", TreeWindow(*_begin(problem)), lag, progress)
 
 
 def _begin(problem: Problem) -> tuple[Message, float]:

@@ -109,10 +109,7 @@ def predict_message(
     if link is not None:
         head[row : row + DIM, :DIM], head[row : row + DIM, E:] = link[:, :DIM], link[:, DIM:]
         row += DIM
-    for one in rows:
-        k = one.b.size
-        head[row : row + k, E:-1], head[row : row + k, -1] = one.H.reshape(k, D), one.b.ravel()
-        row += k
+    _fill_rows(head[row:, E:], rows)
     R = dgeqrf(A, overwrite_a=1)[0]
     top = np.asfortranarray(R[E : E + D, E:])
     top[:, :D] *= _mask_upper(D)
@@ -149,21 +146,18 @@ def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = Fal
     y, first = np.zeros(D), 1 if weighted else 0
     for passes in range(first, first + 1 if weighted or not robust else PASSES):
         top, beside, fault = ahead.top, None, None
-        plain = [one for one in rows if tests is None or one.name not in tests]
+        own = [one.weigh(y) for one in rows] if passes else rows
+        plain = [one for one in own if tests is None or one.name not in tests]
         if plain:
             tail = np.zeros((sum(one.b.size for one in plain), top.shape[1]))
-            row = 0
-            for one in plain:
-                H, b, _ = one.weigh(y, passes)
-                tail[row : row + b.size, :D], tail[row : row + b.size, D] = H.reshape(-1, D), b.ravel()
-                row += b.size
+            _fill_rows(tail[:, : D + 1], plain)
             top, _ = _append_rows(top, tail)
         if tests is not None:
-            top, beside, fault = _add_tested_rows(top, tests.copy(), rows, y, passes, place.t, ahead.state)
+            top, beside, fault = _add_tested_rows(top, tests.copy(), own, place.t, ahead.state)
         y, info = dtrtrs(top[:, :D], top[:, D])
         if info:
             raise explain_smoother(place.t)
-    measured = (*ahead.measured, *rows)
+    measured = (*ahead.measured, *own)
     turns = ahead.before.turns and all(one.turns for one in measured)
     R, z = np.ascontiguousarray(top[:, :D]), top[:, D].copy()
     message = Message(ahead.state, ahead.values, ahead.columns, R, z, beside, turns)
@@ -171,17 +165,16 @@ def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = Fal
 
 
 def _add_tested_rows(
-    top: Array, tests: Watch, rows: Sequence[Measured], y: Array, passes: int, t: float, state: States
+    top: Array, tests: Watch, rows: Sequence[Measured], t: float, state: States
 ) -> tuple[Array, Watch, tuple[str, float] | None]:
     """Add the measurements that have tests to the rows [R z Z] of a message, Z = R X (D, C)."""
     fault, D, speed = None, len(top), float(np.linalg.norm(state.v))
     for one in rows:
         if one.name not in tests or not one.H.any():  # none of those that are left out
             continue
-        H, b, sigma = one.weigh(y, passes)
-        own, columns, errors = tests.begin(one.name, t, sigma)
+        own, columns, errors = tests.begin(one.name, t, one.sigma)
         tail = np.zeros((len(errors), top.shape[1]))
-        tail[:, :D], tail[:, D] = H.reshape(-1, D), b.ravel()
+        _fill_rows(tail[:, : D + 1], [one])
         tail[:, D + 1 :][:, columns] = errors
         top = top.copy(order="F")
         top[:, D + 1 :][:, own] = 0.0
@@ -191,6 +184,15 @@ def _add_tested_rows(
             fault = one.name, since
     tests.take_message(top[:, :D], top[:, D + 1 :])
     return top, tests, fault
+
+
+def _fill_rows(out: Array, rows: Sequence[Measured]) -> None:
+    """Rows of measurements [H b] one below the other, in the first of `out` (n, D + 1)."""
+    row, D = 0, out.shape[1] - 1
+    for one in rows:
+        k = one.b.size
+        out[row : row + k, :D], out[row : row + k, D] = one.H.reshape(k, D), one.b.ravel()
+        row += k
 
 
 def _append_rows(top: Array, tail: Array) -> tuple[Array, Array]:

@@ -115,20 +115,14 @@ class Measured:
     scale: float | Array
     turns: bool = False  # whether they are invariant to a rotation about the vertical
 
-    def weigh(self, y: Array, passes: int) -> tuple[Array, Array, Array]:
-        """H, b and sigma, by the kernel's weights for the error state y once `passes` is not 0."""
-        if self.kernel == "none" or not passes:
-            return self.H, self.b, self.sigma
+    def weigh(self, y: Array) -> Measured:
+        """The same with the kernel's weights for the error state y (D,), and no kernel any more."""
+        if self.kernel == "none":
+            return self
         left = self.b - mv(self.H, np.broadcast_to(y, (len(self.b), len(y))))
         weight = np.sqrt(weigh_squares(self.kernel, np.linalg.norm(left, axis=-1), self.scale)[0])[:, None]
         with np.errstate(divide="ignore"):
-            return self.H * weight[..., None], self.b * weight, self.sigma / weight
-
-    def settle(self, y: Array) -> Measured:
-        """The same with the kernel's weights for the error state y (D,) for good."""
-        if self.kernel == "none":
-            return self
-        H, b, sigma = self.weigh(y, 1)
+            H, b, sigma = self.H * weight[..., None], self.b * weight, self.sigma / weight
         return replace(self, H=H, b=b, sigma=sigma, kernel="none")
 
 
@@ -145,7 +139,7 @@ class Stage:
     g: Array  # (D before,)
     lost: Array  # rows that were eliminated, or are about another point
     C: Array  # (lost, lost)
-    measured: tuple[Measured, ...] = ()
+    measured: tuple[Measured, ...] = ()  # with the weights of kernels
     fault: tuple[str, float] | None = None  # constraint with a detected fault, and its onset (s)
     psi: float = 0.0  # rad, how far its point has turned about the vertical since its rows were linearised
 

@@ -163,19 +163,16 @@ class Window:
 
         `ahead` is its prediction after the newest keyframe, if prepared already: only late rows are then added.
         """
-        stage, e = self._update(self.expect(place) if ahead is None else replace(ahead, place=place))
-        self._append(stage.move(e))
+        ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
+        point = [place], ahead.state, [ahead.values], ahead.columns
+        stage, e = update_late(ahead, linearise_keyframes(*point, linked=False, late=True)[0].measured)
+        self._append(ahead, stage, e)
         turn = split_turn(stage.message.state, e[None])[1][0] if stage.message.turns else e
         return float(np.linalg.norm(turn[:3]))
 
-    @staticmethod
-    def _update(ahead: Predicted) -> tuple[Stage, Array]:
-        """A keyframe with all its rows, about its prediction, and the error state (D,) that is most likely there."""
-        point = [ahead.place], ahead.state, [ahead.values], ahead.columns
-        return update_late(ahead, linearise_keyframes(*point, linked=False, late=True)[0].measured)
-
-    def _append(self, stage: Stage) -> None:
-        self.stages.append(stage)
+    def _append(self, ahead: Predicted, stage: Stage, e: Array) -> None:
+        """Append a keyframe with all its rows, about its prediction, and moved by the most likely error state (D,)."""
+        self.stages.append(stage.move(e))
         self._means = None
         columns = stage.message.columns
         if columns != self._limit[0]:
