@@ -23,6 +23,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from graphnav.core.memory import return_memory
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.factor_graph.tree_nodes import (
@@ -235,7 +236,8 @@ class Tree:
     def read(self) -> None:
         """Bring all estimates up to date."""
         self._enter()
-        take_deltas(self.isam, self.variables.values())
+        if self.isam is not None:
+            take_deltas(self.isam, self.variables.values())
 
     def find_moves(self) -> Array:
         """(K,) how far keyframes' estimates are from where their rows were linearised, 1 at the limit."""
@@ -305,6 +307,11 @@ class Tree:
         self._replace(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
 
     # ---------------------------------------------------------------------------------------------------- leaving
+    def release(self) -> None:
+        """Let go of GTSAM's tree, where all leave: of a whole drive it is larger than all else."""
+        self.isam = None
+        return_memory()
+
     def truncate(self, keep: int) -> None:
         """Remove all but the first keyframes, because something before the others has changed."""
         entered = len(self) - len(self._waiting)

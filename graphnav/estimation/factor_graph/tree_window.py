@@ -98,7 +98,10 @@ class TreeWindow(Window):
         return False
 
     def _begin_leaving(self, count: int) -> Elimination:
-        return Elimination(self.tree, self.tree.held + count, self.tree.held)
+        leaving = Elimination(self.tree, self.tree.held + count, self.tree.held)
+        if count == len(self.stages):
+            self.tree.release()
+        return leaving
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what has been done for stages that are to leave, which is made again."""
