@@ -78,7 +78,7 @@ class Tree:
     """
 
     def __init__(self, prior: Message, turn: float) -> None:
-        self.isam = make_isam()
+        self.isam: Any = make_isam()
         self.turn = turn
         self._waiting: list[
             tuple[list[Made], list[Any]]
