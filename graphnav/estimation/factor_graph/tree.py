@@ -55,7 +55,6 @@ from graphnav.estimation.solvers.stages import (
     Message,
     Place,
     append_columns,
-    group_runs,
 )
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next
@@ -280,14 +279,15 @@ class Tree:
         self._enter()
         links = {k for i in rows for k in (i, i + 1) if k < len(self) and LINK in self.keyframes[k].slots}
         made: list[Made] = []
-        for run in group_runs(sorted(rows | links), lambda last, i: i == last + 1):
-            first, own = run[0], self.keyframes[run[0] : run[-1] + 1]
+        wanted = np.array(sorted(rows | links))
+        for run in np.split(wanted, np.flatnonzero(np.diff(wanted) > 1) + 1):
+            first, own = int(run[0]), self.keyframes[run[0] : run[-1] + 1]
             places = renewed(first - self.held, first - self.held + len(own))
             # the interval before the oldest keyframe is gone
             places = [p if LINK in k.slots else replace(p, linked=False) for p, k in zip(places, own, strict=True)]
             around = [self.keyframes[max(first - 1, 0)], *own]
             values, columns, turns = [k.values for k in around], [k.columns for k in own], compute_turns(around)
-            for k, linear in linearise_runs(places, read_states(around), values, columns):
+            for k, linear in enumerate(linearise_runs(places, read_states(around), values, columns)):
                 i, keyframe = first + k, own[k]
                 if i in links:
                     assert linear.link is not None

@@ -18,7 +18,7 @@ the right, which go through the same QR.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,7 +35,7 @@ from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import Columns, Points, Step, linearise, linearise_links, scale_at, shift
 from graphnav.estimation.solvers.robust import soften, weigh_squares
 from graphnav.estimation.solvers.turning import add_turning, change_of_point, split_turn
-from graphnav.imu.dynamics import SCALE, ImuFactors
+from graphnav.imu.dynamics import SCALE
 
 _I = np.eye(DIM)
 
@@ -241,28 +241,12 @@ def pad(rows: Sequence[Array], width: int) -> Array:
     return out
 
 
-def follows(place: Place, last: Place) -> bool:
-    """Whether a keyframe is the next after another of the same problem, so that they can be linearised together."""
-    return place.problem is last.problem and place.k == last.k + 1
-
-
 def forget_rows(stages: list[Stage]) -> None:
     """Drop the problems that the rows of the last stages come from: each would keep the rows around it in memory."""
     for k in range(len(stages) - 1, -1, -1):
         if stages[k].place.problem is None:
             break  # nor have those before it
         stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
-
-
-def group_runs(which: Iterable[int], alike: Callable[[int, int], bool]) -> list[list[int]]:
-    """Indices in runs, in which each is `alike` the one before it."""
-    runs: list[list[int]] = []
-    for k in which:
-        if runs and alike(runs[-1][-1], k):
-            runs[-1].append(k)
-        else:
-            runs.append([k])
-    return runs
 
 
 def linearise_keyframes(
@@ -288,9 +272,9 @@ def linearise_keyframes(
     links: list[Array | None] = [None] * n
     if linked:
         scale = scale_at(columns, points.values[0])
-        motion = ImuFactors(problem.intervals[slice(first - 1, first - 1 + n)], problem.frame)
         link = np.zeros((n, DIM, DIM + D + 1))
-        link[:, :, :DIM], link[:, :, DIM : 2 * DIM], S, link[:, :, -1] = linearise_links(motion, states, scale)
+        found = linearise_links(problem.motion, states, scale, slice(first - 1, first - 1 + n))
+        link[:, :, :DIM], link[:, :, DIM : 2 * DIM], S, link[:, :, -1] = found
         if scale is not None:
             link[:, :, DIM:][:, :, columns[SCALE]] = S
         links = list(link)
