@@ -22,7 +22,7 @@ from graphnav.estimation.faults.watch import Watch
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.recursion import PASSES
-from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, count_columns, rotate_columns
+from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, count_columns
 
 _BLOCK = 8  # reflectors that tpqrt applies at once
 
@@ -83,11 +83,6 @@ def predict_message(
     head[:D0, to], head[:D0, -1] = R0, before.z
     if tests is not None:
         A[:D0, E + D + 1 :] = R0 @ tests.X
-    apart = np.zeros(DIM) if place.linked else state.minus(before.state)[0]
-    if np.any(apart):  # the same state, about its new point
-        head[:D0, -1] -= R0[:, :DIM] @ apart
-        J = before.change_of_point(apart)
-        head[:D0, E : E + len(J)] = head[:D0, E : E + len(J)] @ J
     moved = values[: D0 - DIM] - before.values
     for at in gone:
         moved[shift(at)] = 0.0
@@ -120,12 +115,8 @@ def predict_message(
     g = np.zeros(D0)
     g[DIM:] = values[: D0 - DIM] - before.values
     G, g[lost], noise = -root @ R[:E, E : E + D], root @ R[:E, E + D], root @ root.T
-    if not place.linked:  # no part of the state is eliminated, but its attitude is about another point
-        J = before.change_of_point(apart)
-        k = len(J)
-        J = rotate_columns(np.eye(k, D), J)
-        G, lost, noise = np.concatenate([J, G]), np.concatenate([np.arange(k), lost]), np.pad(noise, (k, 0))
-        g[:DIM] += apart
+    if not place.linked:  # no part of the state is eliminated, but it may be about another point later
+        G, lost, noise = np.vstack([np.eye(DIM, D), G]), np.append(np.arange(DIM), lost), np.pad(noise, (DIM, 0))
     return Predicted(before, place, state, values, columns, link, top, G, g, lost, noise, tuple(rows))
 
 

@@ -118,6 +118,10 @@ class Revision:
         around = [before, *(stage.message for stage in old)]
         moves = [np.zeros(len(before.z)), *means]
         states = add_error(States.stack([m.state for m in around]), np.array([e[:DIM] for e in moves]), before.turns)
+        if not places[0].linked:  # the same state as in the message before
+            apart = states[1:2].minus(states[:1])[0]
+            before = self._before = before.move(np.append(apart, np.zeros(len(before.values))))
+            states = States.stack([before.state, before.state, states[2:]])
         values = [m.values + e[DIM:] for m, e in zip(around, moves, strict=True)]
         columns = [stage.message.columns for stage in old]
         before = replace(before, tests=None)
