@@ -43,7 +43,6 @@ from graphnav.estimation.factor_graph.tree_nodes import (
     make_isam,
     make_row_factor,
     read_states,
-    rebuild_isam,
     take_deltas,
     update_isam,
 )
@@ -337,11 +336,14 @@ class Tree:
         return {**self.__dict__, "isam": self.isam.getFactorsUnsafe().serialize()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        factors = state.pop("isam")
+        text, graph = state.pop("isam"), gtsam.NonlinearFactorGraph()
         self.__dict__.update(state)
-        self.isam, now = rebuild_isam(factors, {x: x.last for x in self.variables.values()})
-        for k in self.keyframes:
-            k.slots = {name: now[i] for name, i in k.slots.items()}
+        self.isam = make_isam()
+        graph.deserialize(text)
+        factors = {i: one for i in range(graph.size()) if (one := graph.at(i)) is not None}
+        made = [(k, name, factors.pop(i)) for k in self.keyframes for name, i in k.slots.items()]
+        if self.keyframes:
+            self._replace(made, [], self.keyframes[0].number, list(self.variables.values()), list(factors.values()))
 
     def marginalise(self, count: int) -> None:
         """Marginalise the first keyframes, and the parameters' nodes that only they touch."""

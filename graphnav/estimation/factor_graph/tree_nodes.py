@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -212,24 +212,3 @@ def find_node_limits(columns: Columns, place: Place, begin: int = 0) -> Array:
     """How far parameters may move behind others, up to `begin`, of a variable; empty where nothing limits any."""
     found = find_parameter_limits(columns, place)
     return np.append(np.full(begin, np.inf), found) if np.isfinite(found).any() else np.zeros(0)
-
-
-def rebuild_isam(text: str, order: Mapping[Variable, int]) -> tuple[gtsam.ISAM2, dict[int, int]]:
-    """A tree made again from its serialised factors, and where each of these is now.
-
-    Parameters
-    ----------
-    order : when each variable is eliminated.
-    """
-    isam, known, graph = make_isam(), gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-    known.deserialize(text)
-    alive = [i for i in range(known.size()) if known.at(i) is not None]
-    for i in alive:
-        graph.push_back(known.at(i))
-    new, groups = gtsam.Values(), gtsam.KeyGroupMap()
-    first = min(order.values(), default=0)
-    for x, number in order.items():
-        new.insert(x.key, np.zeros(len(x.unit)))
-        groups.insert2(x.key, number - first)
-    indices = isam.update(graph, new, [], groups).getNewFactorsIndices() if alive else []
-    return isam, dict(zip(alive, indices, strict=True))

@@ -265,10 +265,12 @@ class Window:
             self.head = self.head.move(self.head.estimate)
 
     # ------------------------------------------------------------------------------------------ linearising again
-    def find_first_moved(self, share: float = 1.0) -> int | None:
-        """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
-        far = self._find_moves() > share
-        return int(np.argmax(far)) if far.any() else None
+    def find_first_moved(self, share: float = 1.0, almost: float = 1.0) -> int | None:
+        """The first stage whose point is `almost` as far from the smoothed state as a share of its limit, if any is
+        further than that; else None.
+        """
+        moves = self._find_moves()
+        return int(np.argmax(moves > almost * share)) if np.any(moves > share) else None
 
     def _find_moves(self) -> Array:
         """(n,) how far the smoothed states are from their points, 1 at the limit."""
@@ -305,13 +307,6 @@ class Window:
         while self.revise(len(self), renewed, always, share):
             pass
 
-    def _find_first_again(self, share: float, every: bool) -> int | None:
-        """The first stage to be relinearised, stages that have moved almost as far included."""
-        if every:
-            return 0
-        moves = self._find_moves()
-        return int(np.argmax(moves > _ALMOST * share)) if np.any(moves > share) else None
-
     def linearise_at(self, means: Sequence[Array]) -> None:
         """Have `revise` begin with error states that are given, one of each stage: where filter and smoother may have
         gone astray, another estimate knows better.
@@ -329,7 +324,7 @@ class Window:
         Keyframes may be added and removed before the next portion; rebuilt stages of removed ones are discarded.
         """
         if self._revision is None:
-            first = self._find_first_again(share, always and not self._rounds)
+            first = 0 if always and not self._rounds else self.find_first_moved(share, _ALMOST)
             if first is None or self._rounds == _MAX_RELINEARISATIONS:
                 if first is None:
                     self._relaxation = Relaxation()
