@@ -104,14 +104,14 @@ class Tree:
         rows : measurements, linearised there.
         found : what a filter makes of them, until the tree is read.
         """
-        place, prior = ahead.place, self._prior
+        place, point, prior = ahead.stage.place, ahead.stage.message, self._prior
         if not self.keyframes and place.linked:
             self._add_first_keyframe(place)
         made, known = list[Made](), list[Any]()
         x, nodes = self._open(place, known)
         names = frozenset(one.name for one in rows)
-        keyframe = Keyframe(self._number, place.t, x, ahead.state, ahead.columns, nodes, names)
-        keyframe.put(ahead.state, ahead.values)
+        keyframe = Keyframe(self._number, place.t, x, point.state, point.columns, nodes, names)
+        keyframe.put(point.state, point.values)
         for variable in keyframe.variables:
             variable.last = self._number
             if variable.first == self._number:

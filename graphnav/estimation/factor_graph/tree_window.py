@@ -50,8 +50,11 @@ class TreeWindow(Window):
         super()._append(ahead, stage, e)
         self.tree.add(ahead, stage.measured, self.newest)
 
-    def _adopt_all(self) -> None:
-        """Replace the newest message by what the tree makes of all of its rows now."""
+    def _centre_newest(self) -> None:
+        """As of `Window`, by what the tree makes of all of its rows now."""
+        if not self.stages:
+            super()._centre_newest()
+            return
         self.tree.read()
         stage, newest, R = self.stages[-1], self.tree.keyframes[-1], compute_newest_root(self.tree)
         message = replace(stage.message, state=newest.estimate, values=newest.values, R=R, z=np.zeros(len(R)))
@@ -109,22 +112,16 @@ class TreeWindow(Window):
 
     def _relinearise_keyframes(self, count: int) -> None:
         self.relinearized += count
-        self._adopt_all()
+        self._centre_newest()
 
     def truncate(self, keep: int) -> None:
-        """Forget all but the first `keep` stages: something before what follows has changed."""
-        if keep >= len(self.stages):
-            return
-        del self.stages[keep:]
-        self._leaving = None
-        if keep + self.tree.held == 0:
-            self.tree = Tree(self.head, self.turn)  # it had only just begun
-            return
-        self.tree.truncate(keep + self.tree.held)
-        if self.stages:
-            self._adopt_all()
-        else:
-            self.head = self.head.move(self.head.estimate)
+        """As of `Window`."""
+        if keep < len(self.stages):
+            if keep + self.tree.held:
+                self.tree.truncate(keep + self.tree.held)
+            else:  # it had only just begun
+                self.tree = Tree(self.head, self.turn)
+        super().truncate(keep)
 
     def _marginalise(self, count: int) -> None:
         if len(self.tree) > self.tree.held + count:

@@ -10,7 +10,7 @@ the first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -29,20 +29,12 @@ _BLOCK = 8  # reflectors that tpqrt applies at once
 
 @dataclass(frozen=True)
 class Predicted:
-    """A keyframe that lacks only its late rows, about a point of its own; G, g, C as of `Stage`."""
+    """A keyframe that lacks only its late rows, about a point of its own."""
 
     before: Message  # the message it was predicted from
-    place: Place
-    state: States
-    values: Array
-    columns: Columns
     link: Array | None  # whitened rows of the interval
-    top: Array  # (D, D + 1 + tests) R z of a message without those rows, and what tests have beside it
-    G: Array
-    g: Array
-    lost: Array
-    C: Array
-    measured: tuple[Measured, ...]  # rows in use
+    stage: Stage  # without those rows, and without R z of its message
+    top: Array  # (D, D + 1 + tests) which are here, and what tests have beside them
 
 
 def predict_message(
@@ -117,7 +109,8 @@ def predict_message(
     G, g[lost], noise = -root @ R[:E, E : E + D], root @ R[:E, E + D], root @ root.T
     if not place.linked:  # no part of the state is eliminated, but it may be about another point later
         G, lost, noise = np.vstack([np.eye(DIM, D), G]), np.append(np.arange(DIM), lost), np.pad(noise, (DIM, 0))
-    return Predicted(before, place, state, values, columns, link, top, G, g, lost, noise, tuple(rows))
+    message = Message(state, values, columns, R[:0, :0], R[0, :0])
+    return Predicted(before, link, Stage(place, message, G, g, lost, noise, tuple(rows)), top)
 
 
 def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -> tuple[Stage, Array]:
@@ -131,8 +124,8 @@ def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = Fal
     EstimationError
         If the rows do not determine the state.
     """
-    place, tests = ahead.place, ahead.before.tests
-    D = len(ahead.values) + DIM
+    stage, tests, D = ahead.stage, ahead.before.tests, len(ahead.top)
+    t = stage.place.t
     robust = any(one.kernel != "none" for one in rows)
     y, first = np.zeros(D), 1 if weighted else 0
     for passes in range(first, first + 1 if weighted or not robust else PASSES):
@@ -144,15 +137,15 @@ def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = Fal
             _fill_rows(tail[:, : D + 1], plain)
             top, _ = _append_rows(top, tail)
         if tests is not None:
-            top, beside, fault = _add_tested_rows(top, tests.copy(), own, place.t, ahead.state)
+            top, beside, fault = _add_tested_rows(top, tests.copy(), own, t, stage.message.state)
         y, info = dtrtrs(top[:, :D], top[:, D])
         if info:
-            raise explain_smoother(place.t)
-    measured = (*ahead.measured, *own)
+            raise explain_smoother(t)
+    measured = (*stage.measured, *own)
     turns = ahead.before.turns and all(one.turns for one in measured)
     R, z = np.ascontiguousarray(top[:, :D]), top[:, D].copy()
-    message = Message(ahead.state, ahead.values, ahead.columns, R, z, beside, turns)
-    return Stage(place, message, ahead.G, ahead.g, ahead.lost, ahead.C, measured, fault=fault), y
+    message = replace(stage.message, R=R, z=z, tests=beside, turns=turns)
+    return replace(stage, message=message, measured=measured, fault=fault), y
 
 
 def _add_tested_rows(

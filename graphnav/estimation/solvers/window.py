@@ -163,8 +163,9 @@ class Window:
 
         `ahead` is its prediction after the newest keyframe, if prepared already: only late rows are then added.
         """
-        ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
-        point = [place], ahead.state, [ahead.values], ahead.columns
+        ahead = self.expect(place) if ahead is None else replace(ahead, stage=replace(ahead.stage, place=place))
+        message = ahead.stage.message
+        point = [place], message.state, [message.values], message.columns
         stage, e = update_late(ahead, linearise_keyframes(*point, linked=False, late=True)[0].measured)
         self._append(ahead, stage, e)
         turn = split_turn(stage.message.state, e[None])[1][0] if stage.message.turns else e
@@ -197,8 +198,12 @@ class Window:
             return
         del self.stages[keep:]
         self._means = self._leaving = None
+        self._centre_newest()
+
+    def _centre_newest(self) -> None:
+        """Have the newest message about what is most likely."""
         if self.stages:
-            self.stages[-1] = self.stages[-1].move(self.stages[-1].message.estimate)
+            self.stages[-1] = self.stages[-1].move(self.newest.estimate)
         else:
             self.head = self.head.move(self.head.estimate)
 
@@ -211,7 +216,7 @@ class Window:
             self.stages[first - 1] = replace(stage, message=replace(before, tests=tests))
         self.stages[first:] = stages
         if stages:
-            self.stages[-1] = self.stages[-1].move(self.stages[-1].message.estimate)
+            self._centre_newest()
         self._means = self._leaving = None
         self.relinearized += len(stages)
 
@@ -262,7 +267,7 @@ class Window:
 
     def _marginalise(self, count: int) -> None:
         if not self.stages:
-            self.head = self.head.move(self.head.estimate)
+            self._centre_newest()
 
     # ------------------------------------------------------------------------------------------ linearising again
     def find_first_moved(self, share: float = 1.0, almost: float = 1.0) -> int | None:
