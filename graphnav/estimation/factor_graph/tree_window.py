@@ -25,10 +25,10 @@ from graphnav.estimation.factor_graph.tree_nodes import read_states
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.incremental import Incremental, begin_at, solve_in_turn
+from graphnav.estimation.solvers.incremental import incremental
 from graphnav.estimation.solvers.revision import Relaxation, Renewing
 from graphnav.estimation.solvers.stages import Message, Place, Stage
-from graphnav.estimation.solvers.window import Window, compute_turn_limit
+from graphnav.estimation.solvers.window import Window
 
 _MAX_STEPS = 5
 _CONVERGED_SHARE = 0.02  # of the usual limits, within which the last window is converged
@@ -36,6 +36,8 @@ _CONVERGED_SHARE = 0.02  # of the usual limits, within which the last window is 
 
 class TreeWindow(Window):
     """A window whose estimates are a `Tree`'s."""
+
+    solver = "isam2"
 
     def __init__(self, prior: Message, turn: float) -> None:
         super().__init__(prior, turn)
@@ -144,12 +146,5 @@ def isam2(
     progress: Progress | None = None,
     start: States | None = None,
 ) -> Solution:
-    """Solve a problem keyframe by keyframe with iSAM2.
-
-    Parameters
-    ----------
-    lag : s of future that every settled state has seen; infinite smooths the whole drive.
-    start : one state to begin at, where that is not the prior's mean.
-    """
-    window = TreeWindow(begin_at(problem, start), compute_turn_limit(problem.imu_noise))
-    return solve_in_turn(problem, "isam2", Incremental(window, problem, lag), progress)
+    """Solve a problem keyframe by keyframe with iSAM2, as `incremental` does."""
+    return incremental(problem, lag, progress, start, TreeWindow)

@@ -163,7 +163,7 @@ def _iterate(
         here, likeliest, most, since = figures, figures, -np.inf, 0
         for k in range(_MAX_PASSES):
             used, latest = apply_noise(problem, figures.build_model()), None  # releases the memory of the previous pass
-            latest = _smooth_about(used, about.take_first(end))
+            latest = _smooth_about(used, about.take(slice(end)))
             done += end
             prior_then = figures.log_prior()
             now = float(np.sum(latest[0].log_likelihood)) + prior_then

@@ -85,7 +85,7 @@ def ekf(
         about = (
             _smooth_first(problem, smooth_backward(problem, _run_forward(problem, n)))[0]
             if known is None
-            else known.take_first(n)
+            else known.take(slice(n))
         )
     one = _run_forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
@@ -143,7 +143,7 @@ class Comparison:
         stack, steps = Stack(problem, self._K), advance(problem, self._K)
         one = self._one.lift(problem, about, stack, anew)
         x, P = _start_from_prior(problem)
-        start = _get_start(subtract_points(x, about.take_first(1))[0], P, stack.records)
+        start = _get_start(subtract_points(x, about.take(slice(1)))[0], P, stack.records)
         filtered = tuple(np.empty((2, *x.shape)) for x in (P[0], P, P[0], P))
         Q = self._Q if problem.motion is self._motion else None
         PointFilter(problem, about, stack, steps, one, filtered, whole=False, Q=Q).run(lambda: start, None, None)
@@ -205,7 +205,7 @@ def _run_forward(
         follow = search.follow if search is not None else None
         if decide is not None:
             follow = partial(_hold_errors, decide, about, errors, all_P)
-        start = subtract_points(x, about.take_first(1))[0]
+        start = subtract_points(x, about.take(slice(1)))[0]
         given.run(partial(_get_start, start, P, stack.records, search), follow, progress)
         updates = given.updates
         # from there on it is linearised at the filter's estimate

@@ -90,6 +90,7 @@ def incremental(
     lag: float = 120.0,
     progress: Progress | None = None,
     start: States | None = None,
+    engine: type[Window] = Window,
 ) -> Solution:
     """Solve a problem keyframe by keyframe.
 
@@ -98,8 +99,8 @@ def incremental(
     lag : s, see `Incremental`.
     start : one state to begin at, where that is not the prior's mean.
     """
-    window = Window(begin_at(problem, start), compute_turn_limit(problem.imu_noise))
-    return solve_in_turn(problem, "incremental", Incremental(window, problem, lag), progress)
+    window = engine(begin_at(problem, start), compute_turn_limit(problem.imu_noise))
+    return solve_in_turn(Incremental(window, problem, lag), progress)
 
 
 def begin_at(problem: Problem, start: States | None) -> Message:
@@ -109,9 +110,9 @@ def begin_at(problem: Problem, start: States | None) -> Message:
     return message if start is None else message.move(start.minus(problem.prior.mean)[0])
 
 
-def solve_in_turn(problem: Problem, solver: str, engine: Incremental, progress: Progress | None) -> Solution:
+def solve_in_turn(engine: Incremental, progress: Progress | None) -> Solution:
     """Add all keyframes of a problem in order, and return what settles as a solution."""
-    began = time.perf_counter()
+    began, problem, solver = time.perf_counter(), engine.problem, engine.window.solver
     K, steps = len(problem.t), list_node_steps(problem)
     seconds = np.empty(K)  # processor time of the thread
     for k in range(K):

@@ -28,9 +28,6 @@ class Points:
     states: States
     values: Array  # (K, D-15)
 
-    def take_first(self, n: int) -> Points:
-        return self if n == len(self.values) else Points(self.states[:n], self.values[:n])
-
     def take(self, index: slice | Array) -> Points:
         """Some of them."""
         return Points(self.states[index], self.values[index])

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -119,6 +119,8 @@ class Window:
     prior : message on the first keyframe before any measurement, from `make_first_message`.
     turn : rad that an attitude may move before rows are linearised anew, from `compute_turn_limit`.
     """
+
+    solver: ClassVar[str] = "incremental"  # of a recording's keyframes, by this window
 
     def __init__(self, prior: Message, turn: float) -> None:
         self.turn = turn
