@@ -14,7 +14,7 @@ from graphnav.estimation.factor_graph.tree_window import TreeWindow
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.incremental import Incremental, begin_at, solve_in_turn
-from graphnav.estimation.solvers.stages import Message, Place
+from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.window import Window, compute_turn_limit
 
 
@@ -48,21 +48,18 @@ class _Recorded(Incremental):
 
 def play_window(problem: Problem, lag: float = np.inf, progress: Progress | None = None) -> Replay:
     """By the window."""
-    return _play(problem, "incremental", Window(*_begin(problem)), lag, progress)
+    return _play(problem, Window, lag, progress)
 
 
 def play_isam2(problem: Problem, lag: float = np.inf, progress: Progress | None = None) -> Replay:
     """By GTSAM's iSAM2."""
-    return _play(problem, "isam2", TreeWindow(*_begin(problem), whole=bool(np.isinf(lag))), lag, progress)
+    return _play(problem, TreeWindow, lag, progress)
 
 
-def _begin(problem: Problem) -> tuple[Message, float]:
-    return begin_at(problem, None), compute_turn_limit(problem.imu_noise)
-
-
-def _play(problem: Problem, solver: str, window: Window, lag: float, progress: Progress | None) -> Replay:
+def _play(problem: Problem, engine: type[Window], lag: float, progress: Progress | None) -> Replay:
+    window = engine(begin_at(problem, None), compute_turn_limit(problem.imu_noise))
     recorded = _Recorded(window, problem, lag)
-    settled = solve_in_turn(problem, solver, recorded, progress)
+    settled = solve_in_turn(recorded, progress)
     live = replace(
         settled, solver="live", states=States.stack(recorded.states), covariance=np.array(recorded.covariance)
     )

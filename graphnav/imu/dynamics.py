@@ -287,9 +287,13 @@ class ImuFactors:
         ahead = self.advance(slice(None), states[:-1], scale)
         return self._rotate(states[1:].minus(ahead), states.R_nb[:-1])
 
-    def linearize(self, states: States, scale: Array | None = None) -> tuple[Array, Array, Array, Array]:
-        """`residual` of all intervals, its Jacobians by both ends (n, 15, 15) and by the scale (n, 15, k)."""
-        rows, start = slice(None), states[:-1]
+    def linearize(
+        self, states: States, scale: Array | None = None, rows: slice = slice(None)
+    ) -> tuple[Array, Array, Array, Array]:
+        """Residuals (n, 15) of intervals `rows` between n + 1 states, as of `compute_residual`, Jacobians by both ends
+        (n, 15, 15) and by the scale (n, 15, k).
+        """
+        start = states[:-1]
         ahead, F = self.propagate(rows, start, scale)
         r = states[1:].minus(ahead)
         r_theta = r[:, :3]
@@ -298,8 +302,8 @@ class ImuFactors:
         both[:, :3] = inverse @ rotation.exp(-r_theta) @ both[:, :3]
         Jj = np.tile(np.eye(DIM), (len(F), 1, 1))
         Jj[:, :3, :3] = inverse
-        value = self._rotate(r, start.R_nb)
-        both, Jj = self.rotate_to_body(both, start.R_nb), self.rotate_to_body(Jj, start.R_nb)
+        value, both, Jj = (self.rotate_to_body(x, start.R_nb, rows) for x in (r[..., None], both, Jj))
+        value = value[..., 0]
         # the frame of p and v rotates with the start's attitude
         both[:, 3:6, :3] += rotation.skew(value[:, 3:6])
         both[:, 6:9, :3] += rotation.skew(value[:, 6:9])

@@ -232,7 +232,7 @@ class Tracker(Chain):
         one = self._ahead
         return (
             one is not None
-            and one.keyframe.place.t == t
+            and one.keyframe.stage.place.t == t
             and one.keyframe.before is self.window.newest
             and one.stops is self.stops
             and one.wrong is self._readings.wrong

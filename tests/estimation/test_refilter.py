@@ -24,7 +24,7 @@ from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, advance, linearise, scale_at
-from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter
+from graphnav.estimation.solvers.points import Linearisation, PointFilter
 from graphnav.estimation.solvers.recursion import move_columns
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Stack
@@ -74,7 +74,7 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(built:
     points = Points(smoothed.states.plus(off), smoothed.values)
     K, D = len(built.t), DIM + points.values.shape[1]
     stack, steps = Stack(built, K), advance(built, K)
-    out = FilterErrors(np.empty((K, D)), np.empty((K, D, D)), np.empty((K, D)), np.empty((K, D, D)))
+    out = tuple(np.empty((K, *shape)) for shape in ((D,), (D, D), (D,), (D, D)))
     given = PointFilter(built, points, stack, steps, Linearisation.of(built, points, stack, steps), out)
 
     for k in (3, 60, 150):

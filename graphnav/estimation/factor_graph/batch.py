@@ -22,7 +22,7 @@ from graphnav.core.notes import Note, format_count
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.factor_graph.gaussian import Eliminated, LinearGraph
+from graphnav.estimation.factor_graph.gaussian import Eliminated, eliminate
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.linearise import Points, scale_at
@@ -215,15 +215,13 @@ def _move(points: Points, step: Array) -> Points:
 
 def solve_rows(rows: WhitenedRows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Array, float]:
     """Eliminate the rows; the step (K, D) to their optimum, and the decrease of their cost by it."""
-    graph, size = LinearGraph(), np.sqrt(damping) * compute_column_norms(rows, layout) if damping else None
+    size = np.sqrt(damping) * compute_column_norms(rows, layout) if damping else None
     if size is not None:
         rows = list(rows)
         for width in sorted(set(layout.width)):
             keys = np.array([k for k in layout.keys if layout.width[k] == width])
             rows.append(([(keys, size[keys, :width, None] * np.eye(width))], np.zeros((len(keys), width))))
-    for blocks, b in layout.join(rows):
-        graph.add(blocks, b)
-    eliminated = graph.eliminate(layout.order)
+    eliminated = eliminate(layout.join(rows), layout.order)
     of_variables = dict(zip(layout.order, eliminated.solve(layout.order), strict=True))
     found, gain = layout.split(of_variables, layout.keys), eliminated.decrease()
     if size is not None:  # the damping rows are not part of the cost

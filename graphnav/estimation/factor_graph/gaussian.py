@@ -9,7 +9,7 @@ walks beside loose priors.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import Any
 
@@ -52,36 +52,30 @@ def _make_unit_noise(m: int) -> gtsam.noiseModel.Unit:
     return gtsam.noiseModel.Unit.Create(m)
 
 
-class LinearGraph:
-    """A Gaussian factor graph over vector variables with whitened rows A d = b."""
+def eliminate(rows: Iterable[tuple[FactorBlocks, Array]], order: Iterable[int]) -> Eliminated:
+    """Eliminate variables in this order from whitened rows.
 
-    def __init__(self) -> None:
-        self._graph = gtsam.GaussianFactorGraph()
-
-    def add(self, blocks: FactorBlocks, b: Array) -> None:
-        """N factors of m rows each: sum over blocks of A[n] d[key[n]] = b[n]."""
-        n, m = b.shape
-        unit = _make_unit_noise(m)
+    Parameters
+    ----------
+    rows : blocks and b (N, m), for N factors of m rows: the sum over blocks of A[n] d[key[n]] is b[n].
+    """
+    graph, ordering = gtsam.GaussianFactorGraph(), gtsam.Ordering()
+    make: Any = gtsam.JacobianFactor
+    for blocks, b in rows:
+        unit = _make_unit_noise(b.shape[1])
         # GTSAM keeps matrices by columns: handing them over that way saves it a strided copy
         columns = [np.ascontiguousarray(np.swapaxes(A, 1, 2)).swapaxes(1, 2) for _, A in blocks]
         keys = [k.tolist() for k, _ in blocks]
-        push = self._graph.push_back
-        make: Any = gtsam.JacobianFactor
         if len(blocks) <= 3:
             parts: list[Any] = [part for pair in zip(keys, columns, strict=True) for part in pair]
             for row in zip(*parts, b, strict=True):
-                push(make(*row, unit))
-            return
-        for i in range(n):
-            rows = [(k[i], A[i]) for k, A in zip(keys, columns, strict=True)]
-            push(make_jacobian_factor(rows, b[i]))
-
-    def eliminate(self, order: Sequence[int]) -> Eliminated:
-        """Eliminate the variables in this order."""
-        ordering = gtsam.Ordering()
-        for key in order:
-            ordering.push_back(int(key))
-        return Eliminated(self._graph.eliminateSequential(ordering, gtsam.EliminateQR))
+                graph.push_back(make(*row, unit))
+            continue
+        for i in range(len(b)):
+            graph.push_back(make_jacobian_factor([(k[i], A[i]) for k, A in zip(keys, columns, strict=True)], b[i]))
+    for key in order:
+        ordering.push_back(int(key))
+    return Eliminated(graph.eliminateSequential(ordering, gtsam.EliminateQR))
 
 
 class Eliminated:

@@ -106,10 +106,9 @@ Evaluated = Callable[[States, dict[str, Array]], tuple[Array, Array, dict[str, A
 
 
 def _evaluate_interval(problem: Problem, k: int) -> Evaluated:
-    motion = type(problem.motion)(problem.intervals[k : k + 1], problem.frame)
-
     def evaluate(states: States, given: dict[str, Array]) -> tuple[Array, Array, dict[str, Array]]:
-        start, end, S, b = linearise_links(motion, states, given[SCALE][0] if SCALE in given else None)
+        scale = given[SCALE][0] if SCALE in given else None
+        start, end, S, b = linearise_links(problem.motion, states, scale, slice(k, k + 1))
         return -b[0], np.hstack([start[0], end[0]]), {SCALE: S} if given else {}
 
     return evaluate

@@ -23,14 +23,15 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from graphnav.core.memory import return_memory
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.factor_graph.tree_nodes import (
     LINK,
     ROWS,
-    Fresh,
     Keyframe,
     Made,
+    Nodes,
     Variable,
     are_leaves,
     compute_turns,
@@ -42,7 +43,6 @@ from graphnav.estimation.factor_graph.tree_nodes import (
     make_isam,
     make_row_factor,
     read_states,
-    rebuild_isam,
     take_deltas,
     update_isam,
 )
@@ -54,7 +54,6 @@ from graphnav.estimation.solvers.stages import (
     Message,
     Place,
     append_columns,
-    group_runs,
 )
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next
@@ -66,23 +65,26 @@ _ALMOST = 0.3  # share of the threshold from which variables are relinearised al
 class Tree:
     """Keyframes in an iSAM2.
 
+    They wait, as a filter knows them, and enter together when the tree is read: what changes at a keyframe is
+    eliminated once for all of them, and `ISAM2.update` releases what it has eliminated clique by clique with all that
+    hangs below, which over a whole drive takes longer than all else.
+
     Parameters
     ----------
     prior : message on the first keyframe before any measurement.
     turn : rad that an attitude may move before its rows are linearised anew.
-    whole : whether nothing is ever marginalised. GTSAM's `ISAM2.update` eliminates few variables anew, but releases
-        what it has eliminated clique by clique with all that hangs below: over a whole drive that takes longer than
-        all else. So keyframes wait, and enter together when the tree is read.
     """
 
-    def __init__(self, prior: Message, turn: float, whole: bool = False) -> None:
-        self.isam = make_isam(reuses_slots=not whole)
-        self.turn, self._whole = turn, whole
-        self._waiting: tuple[list[Made], list[Fresh]] = [], []  # factors and variables of a whole drive, to enter
+    def __init__(self, prior: Message, turn: float) -> None:
+        self.isam: Any = make_isam()
+        self.turn = turn
+        self._waiting: list[
+            tuple[list[Made], list[Any]]
+        ] = []  # factors of the newest keyframes, and on their variables
         self.keyframes: list[Keyframe] = []
         self._prior = prior
         self._number = self._key = 0
-        self._in_force: dict[str, tuple[Variable, slice]] = {}
+        self._in_force: Nodes = {}
         self.variables: dict[int, Variable] = {}
         self._first_sigma: dict[str, Array] = {}
         self._constant: set[str] = set()
@@ -102,119 +104,123 @@ class Tree:
         rows : measurements, linearised there.
         found : what a filter makes of them, until the tree is read.
         """
-        place, columns, fresh = ahead.place, ahead.columns, list[Fresh]()  # new variables, with priors among them
+        place, point, prior = ahead.stage.place, ahead.stage.message, self._prior
         if not self.keyframes and place.linked:
             self._add_first_keyframe(place)
-        x = self._add_variable(np.zeros(DIM), _UNIT, place.t)
-        nodes = self._open(place, fresh)
+        made, known = list[Made](), list[Any]()
+        x, nodes = self._open(place, known)
         names = frozenset(one.name for one in rows)
-        keyframe = Keyframe(self._number, place.t, x, ahead.state, columns, nodes, names)
-        for node, _ in nodes.values():
-            node.last = self._number
-        keyframe.put(ahead.state, ahead.values)
-        for node, own in nodes.values():
-            if node.t == place.t:
-                node.point[own] = node.delta[own]
-        made: list[Made] = []
+        keyframe = Keyframe(self._number, place.t, x, point.state, point.columns, nodes, names)
+        keyframe.put(point.state, point.values)
+        for variable in keyframe.variables:
+            variable.last = self._number
+            if variable.first == self._number:
+                variable.point = variable.delta.copy()
         if ahead.link is None:
-            fresh.append((x, make_factor([(x, self._prior.R[:, :DIM])], self._prior.z)))
+            known.append(make_factor([(x, slice(0, DIM), prior.R[:, :DIM])], prior.z))
         else:
-            fresh.append((x, None))
             turns = compute_turns([self.keyframes[-1], keyframe])
             made.append((keyframe, LINK, make_interval_factor(self.keyframes[-1], x, ahead.link, turns)))
         if rows:
-            made.append((keyframe, ROWS, make_row_factor(keyframe, rows, False, np.eye(3))))
+            made.append((keyframe, ROWS, make_row_factor(keyframe, rows, np.eye(3))))
+        keyframe.put(found.state, found.values)
+        self._append(keyframe, made, known)
+
+    def _append(self, keyframe: Keyframe, made: list[Made], known: list[Any]) -> None:
         self.keyframes.append(keyframe)
+        self._waiting.append((made, known))
         self._number += 1
-        if self._whole:
-            self._waiting[0].extend(made)
-            self._waiting[1].extend(fresh)
-            keyframe.put(found.state, found.values)
-            return
-        # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
-        most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
-        order = [(v, max(v.last - keyframe.number + most, 0)) for v in self._find_recent()]
-        update_isam(self.isam, place.t, made, fresh=fresh, order=order)
-        take_deltas(self.isam, keyframe.variables)  # in the root, or eliminated just now
 
     def _add_first_keyframe(self, place: Place) -> None:
         """Add the initial message as a keyframe before the first."""
-        prior = self._prior
-        x, nodes, fresh = self._add_variable(np.zeros(DIM), _UNIT, place.t), {}, []
-        blocks = [(x, prior.R[:, :DIM])]
-        if prior.columns:
-            node = self._add_variable(prior.values, np.ones(len(prior.values)), place.t)
-            fresh.append((node, None))
-            node.limit = find_node_limits(prior.columns, place)
-            nodes = {name: (node, shift(at)) for name, at in prior.columns.items()}
-            blocks.append((node, prior.R[:, DIM:]))
+        prior, columns = self._prior, self._prior.columns
+        x, nodes = self._add_variable(_UNIT, place.t), Nodes()
+        parts = [(x, slice(0, DIM), prior.R[:, :DIM])]
+        if columns:
+            node = self._add_variable(np.ones(len(prior.values)), place.t)
+            node.anchor[:] = prior.values
+            node.limit = find_node_limits(columns, place)
+            nodes = {name: (node, shift(at)) for name, at in columns.items()}
+            parts.append((node, slice(0, len(prior.values)), prior.R[:, DIM:]))
         assert place.problem is not None
         for name, p in place.problem.parameters.items():
-            if name in prior.columns and p.constant:
+            if name in columns and p.constant:
                 self._constant.add(name)
                 self._first_sigma[name] = p.sigma
         self._in_force = nodes
-        self.keyframes.append(Keyframe(self._number, place.t, x, prior.state, prior.columns, nodes, frozenset()))
-        update_isam(self.isam, place.t, fresh=[*fresh, (x, make_factor(blocks, prior.z))])
-        self._number += 1
+        keyframe = Keyframe(self._number, place.t, x, prior.state, columns, nodes, frozenset())
+        known = prior.move(prior.estimate)
+        keyframe.put(known.state, known.values)
+        self._append(keyframe, [], [make_factor(parts, prior.z)])
         self.held = 1
-        take_deltas(self.isam, self.keyframes[0].variables)
 
-    def _find_recent(self) -> Iterable[Variable]:
-        for keyframe in self.keyframes[-3:]:
-            yield keyframe.state
-        yield from {id(n): n for k in self.keyframes[-3:] for n, _ in k.nodes.values()
-                    if n.last >= self._number - 3}.values()  # fmt: skip
-
-    def _add_variable(self, anchor: Array, unit: Array, t: float) -> Variable:
-        none = np.zeros(len(unit))
-        out = Variable(self._key, unit, none.copy(), none, self._number, self._number, t, anchor)
+    def _add_variable(self, unit: Array, t: float) -> Variable:
+        point, delta, anchor = np.zeros((3, len(unit)))
+        out = Variable(self._key, unit, point, delta, anchor, self._number, self._number, t)
         self.variables[self._key] = out
         self._key += 1
         return out
 
-    def _open(self, place: Place, fresh: list[Fresh]) -> dict[str, tuple[Variable, slice]]:
-        """Begin the nodes of parameters that step at a keyframe, and the next ones of constants; which are in force."""
-        steps = list(place.steps)
+    def _open(self, place: Place, known: list[Any]) -> tuple[Variable, Nodes]:
+        """Begin the variable of a state, the nodes of parameters that step there, and the next ones of constants.
+
+        A node is part of the state's variable where the one before it governed a single keyframe, as it will: each of
+        two small eliminations in place of one would pass through all that both touch, and GTSAM would keep both.
+
+        Returns the variable, and the nodes in force.
+        """
+        steps, before = list(place.steps), self._in_force
         self._constant |= {s.name for s in steps if is_constant(place, s.name)}
-        named = {s.name for s in steps}
-        for name in sorted(self._constant.intersection(self._in_force) - named):
-            node, own = self._in_force[name]
+        for name in sorted(self._constant.intersection(before).difference(s.name for s in steps)):
+            node, own = before[name]
             if place.t - node.t >= NODE_EVERY:
                 value = node.anchor[own]
                 steps.append(Step(name, value, _TIED * self._first_sigma[name], 1.0, value))
+        beside, constant, rest = list[Step](), list[Step](), list[Step]()
+        for s in steps:
+            brief = s.name in before and before[s.name][0].first == self._number - 1
+            (constant if s.name in self._constant else beside if brief else rest).append(s)
+        self._in_force = in_force = dict(before) if steps else before
+        x = self._begin_nodes(beside, place, before, known, _UNIT)
+        for some in (constant, rest):
+            if some:
+                self._begin_nodes(some, place, before, known)
+        return x, in_force
+
+    def _begin_nodes(
+        self, steps: Sequence[Step], place: Place, before: Nodes, known: list[Any], unit: Array = _UNIT[:0]
+    ) -> Variable:
+        """A variable of numbers in a `unit` and, behind them, nodes of parameters."""
+        sigma = [self._first_sigma.setdefault(s.name, np.asarray(s.sigma, dtype=float)) for s in steps]
+        x, begin = self._add_variable(np.concatenate([unit, *sigma]), place.t), len(unit)
         if not steps:
-            return self._in_force
-        in_force = dict(self._in_force)
-        constant = [s for s in steps if s.name in self._constant]
-        for own_steps in (constant, [s for s in steps if s.name not in self._constant]):
-            if not own_steps:
-                continue
-            columns = append_columns({}, own_steps)
-            unit = [self._first_sigma.setdefault(s.name, np.asarray(s.sigma, dtype=float)) for s in own_steps]
-            mean, sigma = (np.concatenate([getattr(s, name) for s in own_steps]) for name in ("mean", "sigma"))
-            node = self._add_variable(mean, np.concatenate(unit), place.t)
-            node.limit = find_node_limits(columns, place)
-            own_A, old_A = np.diag(1.0 / sigma), dict[int, tuple[Variable, Array]]()
-            for step in own_steps:
-                at = shift(columns[step.name])
-                if step.name in self._in_force and step.decay:
-                    old, was = self._in_force[step.name]
-                    node.anchor[at] = step.predict(old.anchor[was])
-                    _, A = old_A.setdefault(old.key, (old, np.zeros((len(node.unit), len(old.unit)))))
-                    A[at, was] = -step.decay * own_A[at, at]
-                in_force[step.name] = node, at
-            fresh.append((node, make_factor([(node, own_A), *old_A.values()], np.zeros(len(node.unit)))))
-        self._in_force = in_force
-        return in_force
+            return x
+        x.limit = find_node_limits(append_columns({}, steps), place, begin)
+        root = np.diag(1.0 / np.concatenate([s.sigma for s in steps]))
+        parts, at = [(x, slice(begin, len(x.unit)), root)], begin
+        for s in steps:
+            own = slice(at, at + len(s.mean))
+            x.anchor[own], at = s.mean, own.stop
+            if s.name in before and s.decay:
+                old, was = before[s.name]
+                x.anchor[own] = s.predict(old.anchor[was])
+                parts.append((old, was, -s.decay * root[:, own.start - begin : own.stop - begin]))
+            self._in_force[s.name] = x, own
+        known.append(make_factor(parts, np.zeros(len(root))))
+        return x
 
     def _enter(self) -> None:
-        """Take in the keyframes of a whole drive that wait."""
-        (made, fresh), self._waiting = self._waiting, ([], [])
-        if fresh:
-            self._replace(made, [], max(made[0][0].number - 1, 0) if made else 0, fresh)
+        """Take in the keyframes that wait."""
+        waiting, self._waiting = self._waiting, []
+        if waiting:
+            own = self.keyframes[-len(waiting) :]
+            made, known = ([one for part in parts for one in part] for parts in zip(*waiting, strict=True))
+            fresh = [x for k in own for x in k.variables if x.first == k.number]
+            self._replace(made, [], max(own[0].number - 1, self.keyframes[0].number), fresh, known)
 
-    def _replace(self, made: Sequence[Made], gone: Sequence[int], first: int, fresh: Sequence[Fresh] = ()) -> None:
+    def _replace(
+        self, made: Sequence[Made], gone: Sequence[int], first: int, fresh: Sequence[Variable] = (), known: Any = ()
+    ) -> None:
         """Have factors in place of others, on keyframes from number `first` on."""
         # elimination order is that of time; with much to do, GTSAM rebuilds the whole tree
         late = [v for v in self.variables.values() if v.last >= first]
@@ -222,14 +228,14 @@ class Tree:
         if every:
             late, first = list(self.variables.values()), self.keyframes[0].number
         order = [(v, v.last - first) for v in late]
-        update_isam(self.isam, self.keyframes[-1].t, made, gone, fresh, order, late if every else None)
+        update_isam(self.isam, self.keyframes[-1].t, made, gone, fresh, known, order, late if every else None)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:
         """Bring all estimates up to date."""
         self._enter()
-        self.isam.calculateBestEstimate()  # by back-substitution through the whole tree
-        take_deltas(self.isam, self.variables.values())
+        if self.isam is not None:
+            take_deltas(self.isam, self.variables.values())
 
     def find_moves(self) -> Array:
         """(K,) how far keyframes' estimates are from where their rows were linearised, 1 at the limit."""
@@ -241,7 +247,7 @@ class Tree:
         limited = [x for x in self.variables.values() if len(x.limit) and x.last >= first]
         far = {x.key: float(np.max(np.abs(x.delta - x.point) / x.limit)) for x in limited}
         for k, keyframe in enumerate(self.keyframes):
-            moves[k] = max(moves[k], *(far.get(n.key, 0.0) for n, _ in keyframe.nodes.values()), 0.0)
+            moves[k] = max(moves[k], *(far.get(x.key, 0.0) for x in keyframe.variables))
         moves[: self.held] = 0.0
         return moves
 
@@ -259,7 +265,6 @@ class Tree:
         for x in {x.key: x for k in own for x in k.variables}.values() if part < 1.0 else ():
             x.delta = x.point + part * (x.delta - x.point)
         self.linearise_again(which, renewed)
-        self.read()
         return len(which)
 
     def linearise_again(self, which: Iterable[int], renewed: Renewed) -> None:
@@ -273,14 +278,15 @@ class Tree:
         self._enter()
         links = {k for i in rows for k in (i, i + 1) if k < len(self) and LINK in self.keyframes[k].slots}
         made: list[Made] = []
-        for run in group_runs(sorted(rows | links), lambda last, i: i == last + 1):
-            first, own = run[0], self.keyframes[run[0] : run[-1] + 1]
+        wanted = np.array(sorted(rows | links))
+        for run in np.split(wanted, np.flatnonzero(np.diff(wanted) > 1) + 1):
+            first, own = int(run[0]), self.keyframes[run[0] : run[-1] + 1]
             places = renewed(first - self.held, first - self.held + len(own))
             # the interval before the oldest keyframe is gone
             places = [p if LINK in k.slots else replace(p, linked=False) for p, k in zip(places, own, strict=True)]
             around = [self.keyframes[max(first - 1, 0)], *own]
             values, columns, turns = [k.values for k in around], [k.columns for k in own], compute_turns(around)
-            for k, linear in linearise_runs(places, read_states(around), values, columns):
+            for k, linear in enumerate(linearise_runs(places, read_states(around), values, columns)):
                 i, keyframe = first + k, own[k]
                 if i in links:
                     assert linear.link is not None
@@ -288,49 +294,56 @@ class Tree:
                         (keyframe, LINK, make_interval_factor(around[k], keyframe.state, linear.link, turns[k : k + 2]))
                     )
                 if i in rows:
-                    measured = [one for one in linear.measured if one.name in keyframe.names]
+                    zero = np.zeros(DIM + len(values[k + 1]))
+                    measured = [one.weigh(zero) for one in linear.measured if one.name in keyframe.names]
                     if measured and ROWS in keyframe.slots:
-                        made.append((keyframe, ROWS, make_row_factor(keyframe, measured, True, turns[k + 1])))
+                        made.append((keyframe, ROWS, make_row_factor(keyframe, measured, turns[k + 1])))
         gone = [keyframe.slots.pop(name) for keyframe, name, _ in made]
         for i in rows:
-            x = self.keyframes[i].state
-            x.point = x.delta.copy()
-            for node, _ in self.keyframes[i].nodes.values():
-                node.point = node.delta.copy()
+            for x in self.keyframes[i].variables:
+                x.point = x.delta.copy()
         self.version += 1
         self._replace(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
 
     # ---------------------------------------------------------------------------------------------------- leaving
+    def release(self) -> None:
+        """Let go of GTSAM's tree, where all leave: of a whole drive it is larger than all else."""
+        self.isam = None
+        return_memory()
+
     def truncate(self, keep: int) -> None:
         """Remove all but the first keyframes, because something before the others has changed."""
-        if keep >= len(self):
-            return
-        del self.keyframes[keep:]
+        entered = len(self) - len(self._waiting)
+        del self._waiting[max(keep - entered, 0) :], self.keyframes[keep:]
         last = self.keyframes[-1]
         self._number, self._in_force = last.number + 1, last.nodes
         # factors on variables that began later are removed as well
         late = {x.key for x in self.variables.values() if x.first > last.number}
-        factors = self.isam.getFactorsUnsafe()
-        alive = ((i, factors.at(i)) for i in range(factors.size()))
-        own = [i for i, one in alive if one is not None and not late.isdisjoint(one.keys())]
         for key in late:
             del self.variables[key]
         for x in self.variables.values():
             x.last = min(x.last, last.number)
-        self.version += 1
-        self._replace([], own, last.number)
-        self.read()
+        if keep < entered:
+            factors = self.isam.getFactorsUnsafe()
+            alive = ((i, factors.at(i)) for i in range(factors.size()))
+            own = [i for i, one in alive if one is not None and not late.isdisjoint(one.keys())]
+            self.version += 1
+            self._replace([], own, last.number)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the tree itself, which is made again from its factors."""
+        self._enter()
         return {**self.__dict__, "isam": self.isam.getFactorsUnsafe().serialize()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        factors = state.pop("isam")
+        text, graph = state.pop("isam"), gtsam.NonlinearFactorGraph()
         self.__dict__.update(state)
-        self.isam, now = rebuild_isam(factors, {x: x.last for x in self.variables.values()})
-        for k in self.keyframes:
-            k.slots = {name: now[i] for name, i in k.slots.items()}
+        self.isam = make_isam()
+        graph.deserialize(text)
+        factors = {i: one for i in range(graph.size()) if (one := graph.at(i)) is not None}
+        made = [(k, name, factors.pop(i)) for k in self.keyframes for name, i in k.slots.items()]
+        if self.keyframes:
+            self._replace(made, [], self.keyframes[0].number, list(self.variables.values()), list(factors.values()))
 
     def marginalise(self, count: int) -> None:
         """Marginalise the first keyframes, and the parameters' nodes that only they touch."""

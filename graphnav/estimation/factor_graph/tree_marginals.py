@@ -29,7 +29,7 @@ def _map_errors(keyframe: Keyframe, J: Array) -> dict[int, Array]:
     """(D, w) by key: errors about a keyframe's estimate by those about anchors, of which J (3, 3) turns attitudes."""
     D = DIM + len(keyframe.values)
     out = {x.key: np.zeros((D, len(x.unit))) for x in keyframe.variables}
-    out[keyframe.state.key][:DIM] = np.eye(DIM)
+    out[keyframe.state.key][:DIM, :DIM] = np.eye(DIM)
     out[keyframe.state.key][:3, :3] = J
     for name, at in keyframe.columns.items():
         node, own = keyframe.nodes[name]
@@ -141,11 +141,11 @@ class Elimination:
                 node, part = k.nodes[name]
                 out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
             sigma.append(out)
-        about = np.stack([marginal[k.state.key] for k in own])
+        about = np.stack([marginal[k.state.key][:DIM, :DIM] for k in own])
         return SettledStates(
             t=np.array([k.t for k in own]),
             states=read_states(own),
-            covariance=move_covariance(about, np.array([k.state.delta for k in own])),
+            covariance=move_covariance(about, np.array([k.state.delta[:DIM] for k in own])),
             columns=tuple(k.columns for k in own),
             values=values,
             sigma=tuple(sigma),

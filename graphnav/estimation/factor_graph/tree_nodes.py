@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,7 +20,6 @@ from graphnav.estimation.solvers.stages import rotate_columns as turned_by
 from graphnav.estimation.solvers.window import find_parameter_limits
 
 LINK, ROWS = "interval", "rows"  # factors of a keyframe: the interval before it, and all of its measurements together
-_WILDFIRE = np.inf  # updates of older keyframes are propagated when these are read
 
 
 @dataclass(eq=False)
@@ -31,28 +30,31 @@ class Variable:
     unit: Array  # (w,) of its numbers in the tree
     point: Array  # (w,) where its rows are linearised
     delta: Array  # (w,) as it is known now
+    anchor: Array  # (w,) of parameters; 0 for a state's, which is its keyframe's
     first: int  # number of the first keyframe that touches it
     last: int  # and of the last
     t: float  # s, when it began
-    anchor: Array = field(default_factory=lambda: np.zeros(0))  # of parameters
     limit: Array = field(default_factory=lambda: np.zeros(0))  # how far they may move; empty where nothing limits them
+
+
+Nodes = dict[str, tuple[Variable, slice]]  # the node of each parameter in force
 
 
 @dataclass(eq=False)
 class Keyframe:
     number: int
     t: float  # s
-    state: Variable
+    state: Variable  # its first numbers, before those of nodes that may be in it
     anchor: States  # one
     columns: Columns
-    nodes: dict[str, tuple[Variable, slice]]  # the node of each parameter in force
+    nodes: Nodes
     names: frozenset[str]  # of the constraints that it has rows of
     slots: dict[str, int] = field(default_factory=dict)  # index of each of its factors
 
     @property
     def estimate(self) -> States:
         """The state as it is known now."""
-        return self.anchor.plus(self.state.delta[None])
+        return self.anchor.plus(self.state.delta[None, :DIM])
 
     @property
     def values(self) -> Array:
@@ -65,7 +67,7 @@ class Keyframe:
 
     def put(self, state: States, values: Array) -> None:
         """Set what is known now."""
-        self.state.delta = state.minus(self.anchor)[0]
+        self.state.delta[:DIM] = state.minus(self.anchor)[0]
         for name, at in self.columns.items():
             node, own = self.nodes[name]
             node.delta[own] = values[shift(at)] - node.anchor[own]
@@ -77,22 +79,16 @@ class Keyframe:
 
 
 Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, `LINK` or `ROWS`
-Fresh = tuple[Variable, Any]  # a variable that begins, with a factor that comes with it or None
+Part = tuple[Variable, slice, Array]  # some numbers of a variable, and columns (m, k) of rows over them
 
 
-def make_isam(reuses_slots: bool = True) -> gtsam.ISAM2:
-    """An empty tree.
-
-    Parameters
-    ----------
-    reuses_slots : whether new factors take the places of removed ones in GTSAM's list, which each update looks through
-        for them: its length is then bounded where factors leave, and else costs more than all the rest of an update.
-    """
+def make_isam() -> gtsam.ISAM2:
+    """An empty tree."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     parameters.enableRelinearization = False  # by GTSAM: it has a linear problem
-    parameters.findUnusedFactorSlots = reuses_slots
-    parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE))
+    parameters.findUnusedFactorSlots = True  # else GTSAM's list of factors would grow without bound
+    parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))  # substitutes back through all that changed
     return gtsam.ISAM2(parameters)
 
 
@@ -101,7 +97,8 @@ def update_isam(
     t: float,
     made: Sequence[Made] = (),
     gone: Sequence[int] = (),
-    fresh: Sequence[Fresh] = (),
+    fresh: Iterable[Variable] = (),
+    known: Sequence[Any] = (),
     order: Iterable[tuple[Variable, int]] | None = None,
     anew: Iterable[Variable] | None = None,
 ) -> None:
@@ -113,6 +110,7 @@ def update_isam(
     made : their keyframes note where they are.
     gone : indices.
     fresh : variables that begin.
+    known : other factors, which stay.
     order : when variables are eliminated; None leaves it to GTSAM.
     anew : variables that are all eliminated again.
 
@@ -122,12 +120,9 @@ def update_isam(
         For a variable that nothing determines.
     """
     graph, new, groups = gtsam.NonlinearFactorGraph(), gtsam.Values(), None
-    for variable, known in fresh:
+    for variable in fresh:
         new.insert(variable.key, np.zeros(len(variable.unit)))
-        if known is not None:
-            graph.push_back(known)
-    begin = graph.size()
-    for _, _, one in made:
+    for one in (*known, *(one for _, _, one in made)):
         graph.push_back(one)
     if order is not None:
         groups = gtsam.KeyGroupMap()
@@ -139,7 +134,7 @@ def update_isam(
         )
     except RuntimeError as error:  # GTSAM's for a variable that nothing determines
         raise explain_smoother(t) from error
-    for (keyframe, name, _), index in zip(made, list(result.getNewFactorsIndices())[begin:], strict=True):
+    for (keyframe, name, _), index in zip(made, list(result.getNewFactorsIndices())[len(known) :], strict=True):
         keyframe.slots[name] = index
 
 
@@ -168,10 +163,12 @@ def are_leaves(isam: gtsam.ISAM2, variables: Iterable[Variable], others: Iterabl
     return not any(affected.count(x.key) for x in variables)
 
 
-def make_factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
+def make_factor(parts: Iterable[Part], b: Array) -> Any:
     """Whitened rows A e = b as a factor of the tree."""
-    scaled = [(x.key, np.multiply(A, x.unit, order="F")) for x, A in blocks]
-    return gtsam.LinearContainerFactor(make_jacobian_factor(scaled, b))
+    touched: dict[int, Array] = {}
+    for x, at, A in parts:
+        touched.setdefault(x.key, np.zeros((len(b), len(x.unit)), order="F"))[:, at] += A * x.unit[at]
+    return gtsam.LinearContainerFactor(make_jacobian_factor(list(touched.items()), b))
 
 
 def compute_turns(keyframes: Sequence[Keyframe]) -> Array:
@@ -181,36 +178,28 @@ def compute_turns(keyframes: Sequence[Keyframe]) -> Array:
 
 def make_interval_factor(last: Keyframe, x: Variable, link: Array, turns: Array) -> Any:
     """A factor of an interval's whitened rows (15, 15 + D + 1), from the keyframe before to a state, J_r of both."""
-    blocks = [(last.state, turned_by(link[:, :DIM], turns[0])), (x, turned_by(link[:, DIM : 2 * DIM], turns[1]))]
-    return _make_factor(last, blocks, link[:, DIM:-1], link[:, -1])
+    states = [(last.state, turned_by(link[:, :DIM], turns[0])), (x, turned_by(link[:, DIM : 2 * DIM], turns[1]))]
+    return _make_factor(last, states, link[:, DIM:-1], link[:, -1])
 
 
-def make_row_factor(keyframe: Keyframe, measured: Sequence[Measured], weighted: bool, turn: Array) -> Any:
+def make_row_factor(keyframe: Keyframe, measured: Sequence[Measured], turn: Array) -> Any:
     """A factor of measurements linearised where keyframe, of J_r (3, 3), and parameters are now."""
     D = measured[0].H.shape[-1]
-    parts = [one.weigh(np.zeros(D), int(weighted)) for one in measured]
-    H, b = np.concatenate([H.reshape(-1, D) for H, _, _ in parts]), np.concatenate([b.ravel() for _, b, _ in parts])
+    H, b = (np.concatenate(rows) for rows in zip(*((x.H.reshape(-1, D), x.b.ravel()) for x in measured), strict=True))
     return _make_factor(keyframe, [(keyframe.state, turned_by(H[:, :DIM], turn))], H, b)
 
 
-def _make_factor(keyframe: Keyframe, blocks: list[tuple[Variable, Array]], H: Array, b: Array) -> Any:
+def _make_factor(keyframe: Keyframe, states: Sequence[tuple[Variable, Array]], H: Array, b: Array) -> Any:
     """A factor of rows over states' errors about anchors and a keyframe's parameters, H (m, D), as they are now."""
-    b = b + sum(A @ x.delta for x, A in blocks)
-    touched: dict[int, tuple[Variable, Array]] = {}
     filled: list[bool] = np.any(H, axis=0).tolist()
-    for name, at in keyframe.columns.items():
-        if not any(filled[at]):
-            continue
-        node, own = keyframe.nodes[name]
-        _, A = touched.setdefault(node.key, (node, np.zeros((len(b), len(node.unit)))))
-        A[:, own] = H[:, at]
-        b = b + H[:, at] @ node.delta[own]
-    return make_factor([*blocks, *touched.values()], b)
+    touched = ((*keyframe.nodes[name], H[:, at]) for name, at in keyframe.columns.items() if any(filled[at]))
+    parts = [*((x, slice(0, DIM), A) for x, A in states), *touched]
+    return make_factor(parts, b + sum(A @ x.delta[at] for x, at, A in parts))
 
 
 def read_states(keyframes: Sequence[Keyframe]) -> States:
     """Their states as they are known now."""
-    return States.stack([k.anchor for k in keyframes]).plus(np.array([k.state.delta for k in keyframes]))
+    return States.stack([k.anchor for k in keyframes]).plus(np.array([k.state.delta[:DIM] for k in keyframes]))
 
 
 def is_constant(place: Place, name: str) -> bool:
@@ -219,28 +208,7 @@ def is_constant(place: Place, name: str) -> bool:
     return p is not None and p.constant
 
 
-def find_node_limits(columns: Columns, place: Place) -> Array:
-    """How far parameters of a node may move, empty where nothing limits any of them."""
+def find_node_limits(columns: Columns, place: Place, begin: int = 0) -> Array:
+    """How far parameters may move behind others, up to `begin`, of a variable; empty where nothing limits any."""
     found = find_parameter_limits(columns, place)
-    return found if np.isfinite(found).any() else np.zeros(0)
-
-
-def rebuild_isam(text: str, order: Mapping[Variable, int]) -> tuple[gtsam.ISAM2, dict[int, int]]:
-    """A tree made again from its serialised factors, and where each of these is now.
-
-    Parameters
-    ----------
-    order : when each variable is eliminated.
-    """
-    isam, known, graph = make_isam(), gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-    known.deserialize(text)
-    alive = [i for i in range(known.size()) if known.at(i) is not None]
-    for i in alive:
-        graph.push_back(known.at(i))
-    new, groups = gtsam.Values(), gtsam.KeyGroupMap()
-    first = min(order.values(), default=0)
-    for x, number in order.items():
-        new.insert(x.key, np.zeros(len(x.unit)))
-        groups.insert2(x.key, number - first)
-    indices = isam.update(graph, new, [], groups).getNewFactorsIndices() if alive else []
-    return isam, dict(zip(alive, indices, strict=True))
+    return np.append(np.full(begin, np.inf), found) if np.isfinite(found).any() else np.zeros(0)

@@ -1,9 +1,9 @@
 """A window on GTSAM's iSAM2: its keyframes are smoothed, relinearised and marginalised in a tree.
 
 Keyframes are prepared as in `graphnav.estimation.solvers.window`: predicted from a message of the newest keyframe,
-innovations tested, robust rows weighted. From then on the tree holds the rows. Live and settled estimates are its own,
-and so is the message that the next keyframe is predicted from once the past has been linearised anew. The keyframe that
-settled last stays in the tree, so that all behind it can be taken back.
+innovations tested, robust rows weighted. From then on the tree holds the rows. Settled estimates are its own, and so is
+the message of the newest keyframe once the past has been linearised anew; until then that is the filter's, of the same
+rows. The keyframe that settled last stays in the tree, so that all behind it can be taken back.
 
 Of a recording, `isam2` smooths the whole drive in one tree, or as it would be online.
 """
@@ -25,56 +25,42 @@ from graphnav.estimation.factor_graph.tree_nodes import read_states
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.incremental import Incremental, begin_at, solve_in_turn
+from graphnav.estimation.solvers.incremental import incremental
 from graphnav.estimation.solvers.revision import Relaxation, Renewing
 from graphnav.estimation.solvers.stages import Message, Place, Stage
-from graphnav.estimation.solvers.window import Window, compute_turn_limit
+from graphnav.estimation.solvers.window import Window
 
 _MAX_STEPS = 5
 _CONVERGED_SHARE = 0.02  # of the usual limits, within which the last window is converged
-# a look at what has moved of a whole drive costs as much as there are keyframes: the next one follows when there are a
-# part in this many more, and at least so many
-_GROWN, _LEAST = 8, 10
 
 
 class TreeWindow(Window):
-    """A window whose estimates are a `Tree`'s.
+    """A window whose estimates are a `Tree`'s."""
 
-    Parameters
-    ----------
-    prior, turn : as of `Window`.
-    whole : whether nothing ever leaves, as of `Tree`.
-    """
+    solver = "isam2"
 
-    def __init__(self, prior: Message, turn: float, whole: bool = False) -> None:
+    def __init__(self, prior: Message, turn: float) -> None:
         super().__init__(prior, turn)
-        self._whole, self._look = whole, _LEAST
-        self.tree = Tree(prior, turn, whole)
+        self.tree = Tree(prior, turn)
         self._points: Sequence[Array] = ()  # where `revise` linearises first, error states of the stages
 
-    def push(self, place: Place, ahead: Predicted | None = None) -> float:
-        """As of `Window`; the newest message is about the tree's estimate."""
+    def _append(self, ahead: Predicted, stage: Stage, e: Array) -> None:
         if not self.tree.keyframes:
-            self.tree = Tree(self.head, self.turn, self._whole)
-        ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
-        stage, e = self._update(ahead)
-        message = stage.message.move(e)
-        self.tree.add(ahead, [one.settle(e) for one in stage.measured], message)
+            self.tree = Tree(self.head, self.turn)
         if self.stages:  # of those before, the tree knows
             self.stages[-1] = _forget_message(self.stages[-1])
-        newest = self.tree.keyframes[-1]
-        state, values = newest.estimate, newest.values
-        moved = message.move(np.concatenate([state.minus(message.state)[0], values - message.values]))
-        self._append(_replace_message(stage, state, values, moved.R))
-        if self._whole and len(self) >= self._look:
-            self.converge()
-            self._look = len(self) + max(_LEAST, len(self) // _GROWN)
-        return float(np.linalg.norm(e[:3]))
+        super()._append(ahead, stage, e)
+        self.tree.add(ahead, stage.measured, self.newest)
 
-    def _adopt_all(self) -> None:
-        """Replace the newest message by what the tree makes of all of its rows now."""
-        newest, R = self.tree.keyframes[-1], compute_newest_root(self.tree)
-        self.stages[-1] = _replace_message(self.stages[-1], newest.estimate, newest.values, R)
+    def _centre_newest(self) -> None:
+        """As of `Window`, by what the tree makes of all of its rows now."""
+        if not self.stages:
+            super()._centre_newest()
+            return
+        self.tree.read()
+        stage, newest, R = self.stages[-1], self.tree.keyframes[-1], compute_newest_root(self.tree)
+        message = replace(stage.message, state=newest.estimate, values=newest.values, R=R, z=np.zeros(len(R)))
+        self.stages[-1] = replace(stage, message=message)
 
     # ------------------------------------------------------------------------------------------- what the tree knows
     def read_states(self) -> States:
@@ -101,6 +87,7 @@ class TreeWindow(Window):
                 pass
             return places
 
+        self.tree.read()
         for keyframe, stage, e in zip(self.tree.keyframes[self.tree.held :], self.stages, self._points, strict=False):
             keyframe.put(stage.message.state.plus(e[None, :DIM]), stage.message.values + e[DIM:])
         always, self._points = always or bool(len(self._points)), ()
@@ -116,7 +103,10 @@ class TreeWindow(Window):
         return False
 
     def _begin_leaving(self, count: int) -> Elimination:
-        return Elimination(self.tree, self.tree.held + count, self.tree.held)
+        leaving = Elimination(self.tree, self.tree.held + count, self.tree.held)
+        if count == len(self.stages):
+            self.tree.release()
+        return leaving
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what has been done for stages that are to leave, which is made again."""
@@ -124,22 +114,16 @@ class TreeWindow(Window):
 
     def _relinearise_keyframes(self, count: int) -> None:
         self.relinearized += count
-        self._adopt_all()
+        self._centre_newest()
 
     def truncate(self, keep: int) -> None:
-        """Forget all but the first `keep` stages: something before what follows has changed."""
-        if keep >= len(self.stages):
-            return
-        del self.stages[keep:]
-        self._leaving = None
-        if keep + self.tree.held == 0:
-            self.tree = Tree(self.head, self.turn, self._whole)  # it had only just begun
-            return
-        self.tree.truncate(keep + self.tree.held)
-        if self.stages:
-            self._adopt_all()
-        else:
-            self.head = self.head.move(self.head.estimate)
+        """As of `Window`."""
+        if keep < len(self.stages):
+            if keep + self.tree.held:
+                self.tree.truncate(keep + self.tree.held)
+            else:  # it had only just begun
+                self.tree = Tree(self.head, self.turn)
+        super().truncate(keep)
 
     def _marginalise(self, count: int) -> None:
         if len(self.tree) > self.tree.held + count:
@@ -147,12 +131,7 @@ class TreeWindow(Window):
             self.tree.held = 1
             self.head = replace(find_head(self.tree), tests=self.head.tests)
         else:
-            self.tree = Tree(self.head, self.turn, self._whole)
-
-
-def _replace_message(stage: Stage, state: States, values: Array, R: Array) -> Stage:
-    """A stage about what is most likely, of which R (D, D) is known."""
-    return replace(stage, message=replace(stage.message, state=state, values=values, R=R, z=np.zeros(len(R))))
+            self.tree = Tree(self.head, self.turn)
 
 
 def _forget_message(stage: Stage) -> Stage:
@@ -167,12 +146,5 @@ def isam2(
     progress: Progress | None = None,
     start: States | None = None,
 ) -> Solution:
-    """Solve a problem keyframe by keyframe with iSAM2.
-
-    Parameters
-    ----------
-    lag : s of future that every settled state has seen; infinite smooths the whole drive.
-    start : one state to begin at, where that is not the prior's mean.
-    """
-    window = TreeWindow(begin_at(problem, start), compute_turn_limit(problem.imu_noise), whole=bool(np.isinf(lag)))
-    return solve_in_turn(problem, "isam2", Incremental(window, problem, lag), progress)
+    """Solve a problem keyframe by keyframe with iSAM2, as `incremental` does."""
+    return incremental(problem, lag, progress, start, TreeWindow)

@@ -155,7 +155,7 @@ def _iterate(
         likeliest, most, since, most_expected = figures.copy(), -np.inf, 0, 1.0
         for _ in range(_MAX_PASSES):
             used, latest = apply_noise(problem, figures.build_model()), None  # releases the memory of the previous pass
-            latest = _smooth_about(used, about.take_first(end))
+            latest = _smooth_about(used, about.take(slice(end)))
             done += end
             prior_then = figures.log_prior()
             evidence = float(np.sum(latest[0].log_likelihood)) + prior_then - _compute_weight_cost(used, figures)

@@ -51,7 +51,7 @@ from graphnav.estimation.solvers.passes import (
     move_points,
     subtract_points,
 )
-from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter
+from graphnav.estimation.solvers.points import Linearisation, PointFilter
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import STAYS, StretchFilter
@@ -85,7 +85,7 @@ def ekf(
         about = (
             _smooth_first(problem, smooth_backward(problem, _run_forward(problem, n)))[0]
             if known is None
-            else known.take_first(n)
+            else known.take(slice(n))
         )
     one = _run_forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
@@ -143,11 +143,10 @@ class Comparison:
         stack, steps = Stack(problem, self._K), advance(problem, self._K)
         one = self._one.lift(problem, about, stack, anew)
         x, P = _start_from_prior(problem)
-        start = _get_start(subtract_points(x, about.take_first(1))[0], P, stack.records)
-        (e, P), last = np.empty((2, 2, *P.shape)), np.empty((2, 2, len(P)))
-        out = FilterErrors(last[0], e, last[1], P)
+        start = _get_start(subtract_points(x, about.take(slice(1)))[0], P, stack.records)
+        filtered = tuple(np.empty((2, *x.shape)) for x in (P[0], P, P[0], P))
         Q = self._Q if problem.motion is self._motion else None
-        PointFilter(problem, about, stack, steps, one, out, whole=False, Q=Q).run(lambda: start, None, None)
+        PointFilter(problem, about, stack, steps, one, filtered, whole=False, Q=Q).run(lambda: start, None, None)
         return stack
 
 
@@ -192,26 +191,26 @@ def _run_forward(
     watched = [c for c in fixes if c.watched]
     stack = Stack(problem, K, {c.name for c in fixes})
     ahead, found = Points.allocate(K, D - DIM), Points.allocate(K, D - DIM)
-    errors = FilterErrors(np.empty((n, D)), all_Pp, np.empty((n, D)), all_P)
+    errors_predicted, errors = np.empty((2, n, D))
     x, P = _start_from_prior(problem)
     updates = None
     if n:
         one = Linearisation.of(problem, about, stack, steps)
         all_F[: n - 1] = one.F
-        given = PointFilter(problem, about, stack, steps, one, errors)
+        given = PointFilter(problem, about, stack, steps, one, (errors_predicted, all_Pp, errors, all_P))
         search = None
         if watched:
             bank = Bank(watched, problem.t, D, drifts)
             search = FaultSearch(watched, given, steps, stack, bank, problem.t)
         follow = search.follow if search is not None else None
         if decide is not None:
-            follow = partial(_hold_errors, decide, about, errors)
-        start = subtract_points(x, about.take_first(1))[0]
+            follow = partial(_hold_errors, decide, about, errors, all_P)
+        start = subtract_points(x, about.take(slice(1)))[0]
         given.run(partial(_get_start, start, P, stack.records, search), follow, progress)
         updates = given.updates
         # from there on it is linearised at the filter's estimate
         last = about.take(slice(n - 1, n))
-        x = move_points(last, errors.filtered[n - 1 :])
+        x = move_points(last, errors[n - 1 :])
         all_P[n - 1] = transport_covariance(all_P[n - 1 : n], last.states, x.states)[0]
         P = all_P[n - 1]
     else:
@@ -226,8 +225,8 @@ def _run_forward(
         if progress is not None:
             progress("filter", k / K)
     log_likelihood = stack.finish() if whole or watch else stack.log_likelihood()
-    filtered = join_passes([move_points(about, errors.filtered), found.take(slice(n, None))])
-    predicted = join_passes([move_points(about, errors.predicted), ahead.take(slice(n, None))])
+    filtered = join_passes([move_points(about, errors), found.take(slice(n, None))])
+    predicted = join_passes([move_points(about, errors_predicted), ahead.take(slice(n, None))])
     return ForwardRecord(
         filtered.states,
         filtered.values,
@@ -239,8 +238,8 @@ def _run_forward(
         stack.records,
         {c.name: stack.records[c.name].decided for c in fixes},
         about,
-        errors.filtered,
-        errors.predicted,
+        errors,
+        errors_predicted,
         updates,
         log_likelihood,
     )
@@ -276,12 +275,12 @@ def _hold(decide: Decide, k0: int, k1: int, found: Points, all_P: Array) -> int:
     return k1
 
 
-def _hold_errors(decide: Decide, about: Points, errors: FilterErrors, k0: int, k1: int) -> int:
+def _hold_errors(decide: Decide, about: Points, errors: Array, all_P: Array, k0: int, k1: int) -> int:
     """As `_hold`, for errors about given points, which stay fixed."""
     for k in range(k0, k1):
-        here = move_points(about.take(slice(k, k + 1)), errors.filtered[k : k + 1])
-        if (one := decide(k, here, errors.P[k])) is not None:
-            d, errors.P[k] = hold(one, errors.P[k])
-            errors.filtered[k] += d
+        here = move_points(about.take(slice(k, k + 1)), errors[k : k + 1])
+        if (one := decide(k, here, all_P[k])) is not None:
+            d, all_P[k] = hold(one, all_P[k])
+            errors[k] += d
             return k + 1
     return k1

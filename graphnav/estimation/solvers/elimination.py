@@ -10,7 +10,7 @@ the first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -22,27 +22,19 @@ from graphnav.estimation.faults.watch import Watch
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.recursion import PASSES
-from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, count_columns, rotate_columns
+from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, count_columns
 
 _BLOCK = 8  # reflectors that tpqrt applies at once
 
 
 @dataclass(frozen=True)
 class Predicted:
-    """A keyframe that lacks only its late rows, about a point of its own; G, g, C as of `Stage`."""
+    """A keyframe that lacks only its late rows, about a point of its own."""
 
     before: Message  # the message it was predicted from
-    place: Place
-    state: States
-    values: Array
-    columns: Columns
     link: Array | None  # whitened rows of the interval
-    top: Array  # (D, D + 1 + tests) R z of a message without those rows, and what tests have beside it
-    G: Array
-    g: Array
-    lost: Array
-    C: Array
-    measured: tuple[Measured, ...]  # rows in use
+    stage: Stage  # without those rows, and without R z of its message
+    top: Array  # (D, D + 1 + tests) which are here, and what tests have beside them
 
 
 def predict_message(
@@ -83,11 +75,6 @@ def predict_message(
     head[:D0, to], head[:D0, -1] = R0, before.z
     if tests is not None:
         A[:D0, E + D + 1 :] = R0 @ tests.X
-    apart = np.zeros(DIM) if place.linked else state.minus(before.state)[0]
-    if np.any(apart):  # the same state, about its new point
-        head[:D0, -1] -= R0[:, :DIM] @ apart
-        J = before.change_of_point(apart)
-        head[:D0, E : E + len(J)] = head[:D0, E : E + len(J)] @ J
     moved = values[: D0 - DIM] - before.values
     for at in gone:
         moved[shift(at)] = 0.0
@@ -109,10 +96,7 @@ def predict_message(
     if link is not None:
         head[row : row + DIM, :DIM], head[row : row + DIM, E:] = link[:, :DIM], link[:, DIM:]
         row += DIM
-    for one in rows:
-        k = one.b.size
-        head[row : row + k, E:-1], head[row : row + k, -1] = one.H.reshape(k, D), one.b.ravel()
-        row += k
+    _fill_rows(head[row:, E:], rows)
     R = dgeqrf(A, overwrite_a=1)[0]
     top = np.asfortranarray(R[E : E + D, E:])
     top[:, :D] *= _mask_upper(D)
@@ -123,13 +107,10 @@ def predict_message(
     g = np.zeros(D0)
     g[DIM:] = values[: D0 - DIM] - before.values
     G, g[lost], noise = -root @ R[:E, E : E + D], root @ R[:E, E + D], root @ root.T
-    if not place.linked:  # no part of the state is eliminated, but its attitude is about another point
-        J = before.change_of_point(apart)
-        k = len(J)
-        J = rotate_columns(np.eye(k, D), J)
-        G, lost, noise = np.concatenate([J, G]), np.concatenate([np.arange(k), lost]), np.pad(noise, (k, 0))
-        g[:DIM] += apart
-    return Predicted(before, place, state, values, columns, link, top, G, g, lost, noise, tuple(rows))
+    if not place.linked:  # no part of the state is eliminated, but it may be about another point later
+        G, lost, noise = np.vstack([np.eye(DIM, D), G]), np.append(np.arange(DIM), lost), np.pad(noise, (DIM, 0))
+    message = Message(state, values, columns, R[:0, :0], R[0, :0])
+    return Predicted(before, link, Stage(place, message, G, g, lost, noise, tuple(rows)), top)
 
 
 def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -> tuple[Stage, Array]:
@@ -143,45 +124,41 @@ def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = Fal
     EstimationError
         If the rows do not determine the state.
     """
-    place, tests = ahead.place, ahead.before.tests
-    D = len(ahead.values) + DIM
+    stage, tests, D = ahead.stage, ahead.before.tests, len(ahead.top)
+    t = stage.place.t
     robust = any(one.kernel != "none" for one in rows)
     y, first = np.zeros(D), 1 if weighted else 0
     for passes in range(first, first + 1 if weighted or not robust else PASSES):
         top, beside, fault = ahead.top, None, None
-        plain = [one for one in rows if tests is None or one.name not in tests]
+        own = [one.weigh(y) for one in rows] if passes else rows
+        plain = [one for one in own if tests is None or one.name not in tests]
         if plain:
             tail = np.zeros((sum(one.b.size for one in plain), top.shape[1]))
-            row = 0
-            for one in plain:
-                H, b, _ = one.weigh(y, passes)
-                tail[row : row + b.size, :D], tail[row : row + b.size, D] = H.reshape(-1, D), b.ravel()
-                row += b.size
+            _fill_rows(tail[:, : D + 1], plain)
             top, _ = _append_rows(top, tail)
         if tests is not None:
-            top, beside, fault = _add_tested_rows(top, tests.copy(), rows, y, passes, place.t, ahead.state)
+            top, beside, fault = _add_tested_rows(top, tests.copy(), own, t, stage.message.state)
         y, info = dtrtrs(top[:, :D], top[:, D])
         if info:
-            raise explain_smoother(place.t)
-    measured = (*ahead.measured, *rows)
+            raise explain_smoother(t)
+    measured = (*stage.measured, *own)
     turns = ahead.before.turns and all(one.turns for one in measured)
     R, z = np.ascontiguousarray(top[:, :D]), top[:, D].copy()
-    message = Message(ahead.state, ahead.values, ahead.columns, R, z, beside, turns)
-    return Stage(place, message, ahead.G, ahead.g, ahead.lost, ahead.C, measured, fault=fault), y
+    message = replace(stage.message, R=R, z=z, tests=beside, turns=turns)
+    return replace(stage, message=message, measured=measured, fault=fault), y
 
 
 def _add_tested_rows(
-    top: Array, tests: Watch, rows: Sequence[Measured], y: Array, passes: int, t: float, state: States
+    top: Array, tests: Watch, rows: Sequence[Measured], t: float, state: States
 ) -> tuple[Array, Watch, tuple[str, float] | None]:
     """Add the measurements that have tests to the rows [R z Z] of a message, Z = R X (D, C)."""
     fault, D, speed = None, len(top), float(np.linalg.norm(state.v))
     for one in rows:
         if one.name not in tests or not one.H.any():  # none of those that are left out
             continue
-        H, b, sigma = one.weigh(y, passes)
-        own, columns, errors = tests.begin(one.name, t, sigma)
+        own, columns, errors = tests.begin(one.name, t, one.sigma)
         tail = np.zeros((len(errors), top.shape[1]))
-        tail[:, :D], tail[:, D] = H.reshape(-1, D), b.ravel()
+        _fill_rows(tail[:, : D + 1], [one])
         tail[:, D + 1 :][:, columns] = errors
         top = top.copy(order="F")
         top[:, D + 1 :][:, own] = 0.0
@@ -191,6 +168,15 @@ def _add_tested_rows(
             fault = one.name, since
     tests.take_message(top[:, :D], top[:, D + 1 :])
     return top, tests, fault
+
+
+def _fill_rows(out: Array, rows: Sequence[Measured]) -> None:
+    """Rows of measurements [H b] one below the other, in the first of `out` (n, D + 1)."""
+    row, D = 0, out.shape[1] - 1
+    for one in rows:
+        k = one.b.size
+        out[row : row + k, :D], out[row : row + k, D] = one.H.reshape(k, D), one.b.ravel()
+        row += k
 
 
 def _append_rows(top: Array, tail: Array) -> tuple[Array, Array]:

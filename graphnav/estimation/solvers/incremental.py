@@ -24,6 +24,9 @@ from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit, make_first_message
 
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
+# a look at what has moved of a whole drive costs as much as there are keyframes: the next one follows when there are a
+# part in this many more, and at least so many
+_GROWN, _LEAST = 8, 10
 _MAX_INTEGRATIONS = 5  # computing: rounds of integrating about the present biases and relinearising
 # shares of the usual limits within which keyframes have converged that settle, as they are not linearised again
 _SETTLING, _FINE = 0.25, 0.02  # and all that remain at the end
@@ -49,12 +52,15 @@ class Incremental:
     problem: Problem
     lag: float = 120.0
     settled: list[SettledStates] = field(default_factory=list)  # in order; readers may clear them
+    look: float = _LEAST  # keyframes at which what has moved of a whole drive is looked at next
 
     def add(self, place: Place) -> None:
         """Add a keyframe, and settle those that are older than the lag by then."""
         window = self.window
-        if window.push(replace(place, problem=self.problem)) > window.turn:
+        grown = np.isinf(self.lag) and len(window) >= self.look
+        if window.push(replace(place, problem=self.problem)) > window.turn or grown:
             window.converge(renewed=self._renew)
+            self.look = len(window) + max(_LEAST, len(window) // _GROWN)
         if are_due(window.stages[0].place.t, place.t, self.lag):
             self._converge(_SETTLING, any(c.robust != "none" for c in self.problem.constraints))
             self.settled.append(window.settle(int(np.searchsorted(window.t, place.t - self.lag))))
@@ -84,6 +90,7 @@ def incremental(
     lag: float = 120.0,
     progress: Progress | None = None,
     start: States | None = None,
+    engine: type[Window] = Window,
 ) -> Solution:
     """Solve a problem keyframe by keyframe.
 
@@ -92,8 +99,8 @@ def incremental(
     lag : s, see `Incremental`.
     start : one state to begin at, where that is not the prior's mean.
     """
-    window = Window(begin_at(problem, start), compute_turn_limit(problem.imu_noise))
-    return solve_in_turn(problem, "incremental", Incremental(window, problem, lag), progress)
+    window = engine(begin_at(problem, start), compute_turn_limit(problem.imu_noise))
+    return solve_in_turn(Incremental(window, problem, lag), progress)
 
 
 def begin_at(problem: Problem, start: States | None) -> Message:
@@ -103,9 +110,9 @@ def begin_at(problem: Problem, start: States | None) -> Message:
     return message if start is None else message.move(start.minus(problem.prior.mean)[0])
 
 
-def solve_in_turn(problem: Problem, solver: str, engine: Incremental, progress: Progress | None) -> Solution:
+def solve_in_turn(engine: Incremental, progress: Progress | None) -> Solution:
     """Add all keyframes of a problem in order, and return what settles as a solution."""
-    began = time.perf_counter()
+    began, problem, solver = time.perf_counter(), engine.problem, engine.window.solver
     K, steps = len(problem.t), list_node_steps(problem)
     seconds = np.empty(K)  # processor time of the thread
     for k in range(K):

@@ -28,9 +28,6 @@ class Points:
     states: States
     values: Array  # (K, D-15)
 
-    def take_first(self, n: int) -> Points:
-        return self if n == len(self.values) else Points(self.states[:n], self.values[:n])
-
     def take(self, index: slice | Array) -> Points:
         """Some of them."""
         return Points(self.states[index], self.values[index])
@@ -173,13 +170,16 @@ def linearise(
     return Rows(constraint, which, linear, columns, assemble(linear, columns, DIM + values.shape[1]))
 
 
-def linearise_links(motion: ImuFactors, states: States, scale: Array | None) -> tuple[Array, Array, Array, Array]:
-    """Whitened rows of intervals between K states: A (K-1, 15, 15) of both ends, S (K-1, 15, k) of the scale, and b.
+def linearise_links(
+    motion: ImuFactors, states: States, scale: Array | None, which: slice = slice(None)
+) -> tuple[Array, Array, Array, Array]:
+    """Whitened rows of intervals `which` between K states: A (K-1, 15, 15) of both ends, S (K-1, 15, k) of the scale,
+    and b.
 
     A_start d_start + A_end d_end + S d_scale = b
     """
-    r, A_start, A_end, S = motion.linearize(states, scale)
-    W = motion.whitener
+    r, A_start, A_end, S = motion.linearize(states, scale, which)
+    W = motion.whitener[which]
     return W @ A_start, W @ A_end, W @ S, -mv(W, r)
 
 

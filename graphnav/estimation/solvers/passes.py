@@ -17,7 +17,6 @@ from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, So
 from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
 from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, scale_at, shift
 from graphnav.estimation.solvers.recursion import Arrays, RowBlocks
-from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.stack import Innovations
 from graphnav.imu.dynamics import convert_to_biases
 
@@ -203,7 +202,7 @@ def record_residuals(problem: Problem, rows: Constraint, points: Points, robust:
     nis = np.sum((linear.residual / linear.stated) ** 2, axis=-1)
     weight = np.ones(len(rows)) if rows.weight is None else rows.weight
     if robust:
-        weight = weight * weigh_squares(rows.robust, np.sqrt(nis), rows.robust_scale)[0]
+        weight = weight * linear.weigh()[0]
     t = problem.t[rows.keyframe]
     return ConstraintRecord(
         "residual", t, linear.residual, linear.stated, nis, weight, rows.axes, rows.unit, **rows.labels

@@ -25,21 +25,11 @@ from graphnav.estimation.solvers.breakdown import explain_rows
 from graphnav.estimation.solvers.invariant import turn
 from graphnav.estimation.solvers.linearise import Advance, Columns, Points, Rows, linearise, scale_at
 from graphnav.estimation.solvers.passes import Updates
-from graphnav.estimation.solvers.recursion import STRETCH, filter_rows
+from graphnav.estimation.solvers.recursion import STRETCH, Arrays, filter_rows
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 
 _STRETCH_AFTER_FAULT = 4  # keyframes that are filtered at once, behind one at which something was found
 Follow = Callable[[int, int], int]  # checks the filtered keyframes from one to another, and returns where to continue
-
-
-@dataclass(frozen=True)
-class FilterErrors:
-    """Error states (n, D) about given points and their covariances, predicted and filtered."""
-
-    predicted: Array
-    P_predicted: Array
-    filtered: Array
-    P: Array
 
 
 @dataclass(frozen=True)
@@ -99,17 +89,17 @@ class PointFilter:
     Parameters
     ----------
     one : the problem there.
-    out : of all n keyframes, to be filled; of fewer, but two at least, those of the last are left.
+    filtered : as of `graphnav.estimation.solvers.recursion.filter_rows`.
     whole : False for the innovations in the stack only, without gains.
     Q : of the steps, where it is known.
     """
 
     def __init__(
-        self, problem: Problem, points: Points, stack: Stack, steps: Advance, one: Linearisation, out: FilterErrors,
+        self, problem: Problem, points: Points, stack: Stack, steps: Advance, one: Linearisation, filtered: Arrays,
         whole: bool = True, Q: Array | None = None,
     ) -> None:  # fmt: skip
         n = len(points.values)
-        self._stack, self._steps, self.out = stack, steps, out
+        self._stack, self._steps, self._filtered = stack, steps, filtered
         self.F, self.gap = one.F, one.gap
         self.Q = one.compute_noise(problem, points) if Q is None else Q
         self.speeds = np.linalg.norm(points.states.v, axis=1)
@@ -141,15 +131,13 @@ class PointFilter:
                 progress("filter", k / self._stack.K)
 
     def _filter(self, k0: int, k1: int, begin: Callable[[], tuple[Array, Array]]) -> None:
-        out, stack, n = self.out, self._stack, len(self.H)
-        last = (k0 - 1) % len(out.filtered), (k0 - 1) % len(out.P)
-        e, P = (out.filtered[last[0]], out.P[last[1]]) if k0 else begin()
+        stack, n = self._stack, len(self.H)
+        e, P = (x[(k0 - 1) % len(x)] for x in self._filtered[2:]) if k0 else begin()
         try:
             filter_rows(
                 k0, k1, e, P, (self.F, self._steps.decay, self.gap, self.Q, self._steps.added),
                 (self.r, self.H, self.variance, stack.scale[:n]), stack.joint.arrays, self.used,
-                (out.predicted, out.P_predicted, out.filtered, out.P),
-                (stack.root, stack.solved, stack.bent), self.updates.arrays, self._at,
+                self._filtered, (stack.root, stack.solved, stack.bent), self.updates.arrays, self._at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
             raise explain_rows(stack.get_block(int(self._at[0])).parts) from None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,8 +22,6 @@ from graphnav.estimation.solvers.stages import (
     Place,
     Stage,
     add_error,
-    follows,
-    group_runs,
     linearise_keyframes,
 )
 
@@ -119,11 +118,15 @@ class Revision:
         around = [before, *(stage.message for stage in old)]
         moves = [np.zeros(len(before.z)), *means]
         states = add_error(States.stack([m.state for m in around]), np.array([e[:DIM] for e in moves]), before.turns)
+        if not places[0].linked:  # the same state as in the message before
+            apart = states[1:2].minus(states[:1])[0]
+            before = self._before = before.move(np.append(apart, np.zeros(len(before.values))))
+            states = States.stack([before.state, before.state, states[2:]])
         values = [m.values + e[DIM:] for m, e in zip(around, moves, strict=True)]
         columns = [stage.message.columns for stage in old]
         before = replace(before, tests=None)
         out: list[Stage] = []
-        for k, linear in linearise_runs(places, states, values, columns):
+        for k, linear in enumerate(linearise_runs(places, states, values, columns)):
             plain, bent = (tuple(m for m in linear.measured if (m.kernel == "none") == one) for one in (True, False))
             point = states[k + 1 : k + 2], values[k + 1], columns[k]
             stage, _ = update_late(predict_message(before, places[k], linear.link, plain, *point), bent, weighted=True)
@@ -134,7 +137,7 @@ class Revision:
 
 def linearise_runs(
     places: Sequence[Place], states: States, values: Sequence[Array], columns: Sequence[Columns]
-) -> Iterator[tuple[int, Linear]]:
+) -> Iterator[Linear]:
     """The rows of consecutive keyframes, of as many at once as follow each other in one problem.
 
     Parameters
@@ -143,15 +146,12 @@ def linearise_runs(
     states, values : of the keyframe before them, and of them: n + 1.
     """
 
-    def are_alike(last: int, k: int) -> bool:
-        same = places[k].linked == places[last].linked and columns[k] == columns[last]
-        return same and follows(places[k], places[last])
-
-    for run in group_runs(range(len(places)), are_alike):
-        linked, end = places[run[0]].linked, run[-1] + 1
-        points = slice(run[0] if linked else run[0] + 1, end + 1)
-        linears = linearise_keyframes(places[run[0] : end], states[points], values[points], columns[run[0]], linked)
-        yield from zip(run, linears, strict=True)
+    keys = [(id(place.problem), place.k - i, place.linked) for i, place in enumerate(places)]
+    ends = [i for i in range(1, len(places)) if keys[i] != keys[i - 1] or columns[i] != columns[i - 1]]
+    for begin, end in pairwise([0, *ends, len(places)]):
+        linked = places[begin].linked
+        points = slice(begin if linked else begin + 1, end + 1)
+        yield from linearise_keyframes(places[begin:end], states[points], values[points], columns[begin], linked)
 
 
 def _is(stages: Sequence[Stage], k: int, was: Stage) -> bool:

@@ -82,7 +82,7 @@ def _smooth(forward: ForwardRecord, P: Array, t: Array | None = None, progress: 
         errors, _, _, N_diagonal, *_ = _smooth_given(forward, forward.updates, end, r, N, P, progress=progress)
         if len(P):
             _restore_digits(forward, P, N_diagonal)
-        parts = [move_points(about.take_first(end), errors), *parts]
+        parts = [move_points(about.take(slice(end)), errors), *parts]
     return join_passes(parts)
 
 

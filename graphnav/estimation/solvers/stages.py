@@ -18,7 +18,7 @@ the right, which go through the same QR.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,7 +35,7 @@ from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import Columns, Points, Step, linearise, linearise_links, scale_at, shift
 from graphnav.estimation.solvers.robust import soften, weigh_squares
 from graphnav.estimation.solvers.turning import add_turning, change_of_point, split_turn
-from graphnav.imu.dynamics import SCALE, ImuFactors
+from graphnav.imu.dynamics import SCALE
 
 _I = np.eye(DIM)
 
@@ -115,20 +115,14 @@ class Measured:
     scale: float | Array
     turns: bool = False  # whether they are invariant to a rotation about the vertical
 
-    def weigh(self, y: Array, passes: int) -> tuple[Array, Array, Array]:
-        """H, b and sigma, by the kernel's weights for the error state y once `passes` is not 0."""
-        if self.kernel == "none" or not passes:
-            return self.H, self.b, self.sigma
+    def weigh(self, y: Array) -> Measured:
+        """The same with the kernel's weights for the error state y (D,), and no kernel any more."""
+        if self.kernel == "none":
+            return self
         left = self.b - mv(self.H, np.broadcast_to(y, (len(self.b), len(y))))
         weight = np.sqrt(weigh_squares(self.kernel, np.linalg.norm(left, axis=-1), self.scale)[0])[:, None]
         with np.errstate(divide="ignore"):
-            return self.H * weight[..., None], self.b * weight, self.sigma / weight
-
-    def settle(self, y: Array) -> Measured:
-        """The same with the kernel's weights for the error state y (D,) for good."""
-        if self.kernel == "none":
-            return self
-        H, b, sigma = self.weigh(y, 1)
+            H, b, sigma = self.H * weight[..., None], self.b * weight, self.sigma / weight
         return replace(self, H=H, b=b, sigma=sigma, kernel="none")
 
 
@@ -145,7 +139,7 @@ class Stage:
     g: Array  # (D before,)
     lost: Array  # rows that were eliminated, or are about another point
     C: Array  # (lost, lost)
-    measured: tuple[Measured, ...] = ()
+    measured: tuple[Measured, ...] = ()  # with the weights of kernels
     fault: tuple[str, float] | None = None  # constraint with a detected fault, and its onset (s)
     psi: float = 0.0  # rad, how far its point has turned about the vertical since its rows were linearised
 
@@ -247,28 +241,12 @@ def pad(rows: Sequence[Array], width: int) -> Array:
     return out
 
 
-def follows(place: Place, last: Place) -> bool:
-    """Whether a keyframe is the next after another of the same problem, so that they can be linearised together."""
-    return place.problem is last.problem and place.k == last.k + 1
-
-
 def forget_rows(stages: list[Stage]) -> None:
     """Drop the problems that the rows of the last stages come from: each would keep the rows around it in memory."""
     for k in range(len(stages) - 1, -1, -1):
         if stages[k].place.problem is None:
             break  # nor have those before it
         stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
-
-
-def group_runs(which: Iterable[int], alike: Callable[[int, int], bool]) -> list[list[int]]:
-    """Indices in runs, in which each is `alike` the one before it."""
-    runs: list[list[int]] = []
-    for k in which:
-        if runs and alike(runs[-1][-1], k):
-            runs[-1].append(k)
-        else:
-            runs.append([k])
-    return runs
 
 
 def linearise_keyframes(
@@ -294,9 +272,9 @@ def linearise_keyframes(
     links: list[Array | None] = [None] * n
     if linked:
         scale = scale_at(columns, points.values[0])
-        motion = ImuFactors(problem.intervals[slice(first - 1, first - 1 + n)], problem.frame)
         link = np.zeros((n, DIM, DIM + D + 1))
-        link[:, :, :DIM], link[:, :, DIM : 2 * DIM], S, link[:, :, -1] = linearise_links(motion, states, scale)
+        found = linearise_links(problem.motion, states, scale, slice(first - 1, first - 1 + n))
+        link[:, :, :DIM], link[:, :, DIM : 2 * DIM], S, link[:, :, -1] = found
         if scale is not None:
             link[:, :, DIM:][:, :, columns[SCALE]] = S
         links = list(link)

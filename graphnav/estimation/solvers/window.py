@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -120,6 +120,8 @@ class Window:
     turn : rad that an attitude may move before rows are linearised anew, from `compute_turn_limit`.
     """
 
+    solver: ClassVar[str] = "incremental"  # of a recording's keyframes, by this window
+
     def __init__(self, prior: Message, turn: float) -> None:
         self.turn = turn
         self.head = prior  # information before the first stage
@@ -163,19 +165,17 @@ class Window:
 
         `ahead` is its prediction after the newest keyframe, if prepared already: only late rows are then added.
         """
-        stage, e = self._update(self.expect(place) if ahead is None else replace(ahead, place=place))
-        self._append(stage.move(e))
+        ahead = self.expect(place) if ahead is None else replace(ahead, stage=replace(ahead.stage, place=place))
+        message = ahead.stage.message
+        point = [place], message.state, [message.values], message.columns
+        stage, e = update_late(ahead, linearise_keyframes(*point, linked=False, late=True)[0].measured)
+        self._append(ahead, stage, e)
         turn = split_turn(stage.message.state, e[None])[1][0] if stage.message.turns else e
         return float(np.linalg.norm(turn[:3]))
 
-    @staticmethod
-    def _update(ahead: Predicted) -> tuple[Stage, Array]:
-        """A keyframe with all its rows, about its prediction, and the error state (D,) that is most likely there."""
-        point = [ahead.place], ahead.state, [ahead.values], ahead.columns
-        return update_late(ahead, linearise_keyframes(*point, linked=False, late=True)[0].measured)
-
-    def _append(self, stage: Stage) -> None:
-        self.stages.append(stage)
+    def _append(self, ahead: Predicted, stage: Stage, e: Array) -> None:
+        """Append a keyframe with all its rows, about its prediction, and moved by the most likely error state (D,)."""
+        self.stages.append(stage.move(e))
         self._means = None
         columns = stage.message.columns
         if columns != self._limit[0]:
@@ -200,8 +200,12 @@ class Window:
             return
         del self.stages[keep:]
         self._means = self._leaving = None
+        self._centre_newest()
+
+    def _centre_newest(self) -> None:
+        """Have the newest message about what is most likely."""
         if self.stages:
-            self.stages[-1] = self.stages[-1].move(self.stages[-1].message.estimate)
+            self.stages[-1] = self.stages[-1].move(self.newest.estimate)
         else:
             self.head = self.head.move(self.head.estimate)
 
@@ -214,7 +218,7 @@ class Window:
             self.stages[first - 1] = replace(stage, message=replace(before, tests=tests))
         self.stages[first:] = stages
         if stages:
-            self.stages[-1] = self.stages[-1].move(self.stages[-1].message.estimate)
+            self._centre_newest()
         self._means = self._leaving = None
         self.relinearized += len(stages)
 
@@ -265,13 +269,15 @@ class Window:
 
     def _marginalise(self, count: int) -> None:
         if not self.stages:
-            self.head = self.head.move(self.head.estimate)
+            self._centre_newest()
 
     # ------------------------------------------------------------------------------------------ linearising again
-    def find_first_moved(self, share: float = 1.0) -> int | None:
-        """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
-        far = self._find_moves() > share
-        return int(np.argmax(far)) if far.any() else None
+    def find_first_moved(self, share: float = 1.0, almost: float = 1.0) -> int | None:
+        """The first stage whose point is `almost` as far from the smoothed state as a share of its limit, if any is
+        further than that; else None.
+        """
+        moves = self._find_moves()
+        return int(np.argmax(moves > almost * share)) if np.any(moves > share) else None
 
     def _find_moves(self) -> Array:
         """(n,) how far the smoothed states are from their points, 1 at the limit."""
@@ -308,13 +314,6 @@ class Window:
         while self.revise(len(self), renewed, always, share):
             pass
 
-    def _find_first_again(self, share: float, every: bool) -> int | None:
-        """The first stage to be relinearised, stages that have moved almost as far included."""
-        if every:
-            return 0
-        moves = self._find_moves()
-        return int(np.argmax(moves > _ALMOST * share)) if np.any(moves > share) else None
-
     def linearise_at(self, means: Sequence[Array]) -> None:
         """Have `revise` begin with error states that are given, one of each stage: where filter and smoother may have
         gone astray, another estimate knows better.
@@ -332,7 +331,7 @@ class Window:
         Keyframes may be added and removed before the next portion; rebuilt stages of removed ones are discarded.
         """
         if self._revision is None:
-            first = self._find_first_again(share, always and not self._rounds)
+            first = 0 if always and not self._rounds else self.find_first_moved(share, _ALMOST)
             if first is None or self._rounds == _MAX_RELINEARISATIONS:
                 if first is None:
                     self._relaxation = Relaxation()
