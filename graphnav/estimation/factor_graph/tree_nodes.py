@@ -79,7 +79,7 @@ class Keyframe:
 
 
 Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, `LINK` or `ROWS`
-Part = tuple[Variable, slice, Array]  # some numbers of a variable, and columns (m, k) of rows over them
+VariablePart = tuple[Variable, slice, Array]  # some numbers of a variable, and columns (m, k) of rows over them
 
 
 def make_isam() -> gtsam.ISAM2:
@@ -163,7 +163,7 @@ def are_leaves(isam: gtsam.ISAM2, variables: Iterable[Variable], others: Iterabl
     return not any(affected.count(x.key) for x in variables)
 
 
-def make_factor(parts: Iterable[Part], b: Array) -> Any:
+def make_factor(parts: Iterable[VariablePart], b: Array) -> Any:
     """Whitened rows A e = b as a factor of the tree."""
     touched: dict[int, Array] = {}
     for x, at, A in parts:
