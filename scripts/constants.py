@@ -73,7 +73,9 @@ CONSTANTS = (
         2.0,
         whole=True,
     ),
-    Constant(f"{NOISE}.moments", "_CONTROLLED", "least redundancy that controls a row (Foerstner)", 3.0),
+    Constant(
+        f"{NOISE}.moments", "_CONTROLLED", "redundancy that controls a row: the square of a tenth of a sigma", 3.0
+    ),
     Constant(f"{NOISE}.components", "_LONGEST", "computing: longest step of a logarithm", 1.5),
     Constant(f"{NOISE}.estimate", "_SETTLED", "computing: gain of a pass at convergence", 3.0),
     Constant(f"{NOISE}.estimate", "_RELAXATION", "computing: steps of correlation times", 1.3),

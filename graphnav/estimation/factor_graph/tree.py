@@ -78,9 +78,8 @@ class Tree:
     def __init__(self, prior: Message, turn: float) -> None:
         self.isam: Any = make_isam()
         self.turn = turn
-        self._waiting: list[
-            tuple[list[Made], list[Any]]
-        ] = []  # factors of the newest keyframes, and on their variables
+        # factors of the newest keyframes, and on their variables
+        self._waiting: list[tuple[list[Made], list[Any]]] = []
         self.keyframes: list[Keyframe] = []
         self._prior = prior
         self._number = self._key = 0

@@ -34,7 +34,7 @@ from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import ImuMoments, Moments, collect_moments, lag_moments
 from graphnav.estimation.noise.outliers import compute_interval_cost, compute_row_costs, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN
-from graphnav.estimation.noise.tails import CHANCE, compute_bounded_mean, estimate_tail_index, weigh_scaled
+from graphnav.estimation.noise.tails import CHANCE, compute_bounded_mean, estimate_tail_index, find_peak, weigh_scaled
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -287,9 +287,8 @@ def _improve(
     for rows in problem.constraints:
         if rows.name in moments.rows:
             found, (names, index) = moments.rows[rows.name], rows.list_noise_groups()
-            grown = np.array([*(np.exp(figures.log[name] - before[name]) for name in names), 1.0])[
-                index[: len(found.A)]
-            ]
+            factors = np.array([*(np.exp(figures.log[name] - before[name]) for name in names), 1.0])
+            grown = factors[index[: len(found.A)]]
             # with the figures of the next pass: B is the share of the row's own variance in that of its prediction
             _weigh_rows(figures, problem, rows, found.left_out / np.mean(1.0 + found.B * (grown - 1.0), axis=1))
     return gain
@@ -348,16 +347,13 @@ def _improve_time(figures: Components, chain: ParameterChain, observed: Array, l
     for group in groups:
         m, s = figures.get_prior(group)
         value -= 0.5 * ((figures.log[group] + np.log(grown) - m) / s) ** 2
-    value[(times < median / _TIME_RANGE) | (times > median * _TIME_RANGE)] = -np.inf
-    j = int(np.clip(np.argmax(value), 1, len(_TIME_GRID) - 2))
-    low, here, high = value[j - 1 : j + 2]
-    bend = low - 2.0 * here + high
-    off = 0.5 * (low - high) / bend if -np.inf < bend < 0.0 else 0.0
-    x = _TIME_GRID[j] + (_TIME_GRID[1] - _TIME_GRID[0]) * float(np.clip(off, -1.0, 1.0))
-    x = float(np.clip(_RELAXATION * x, _TIME_GRID[0], _TIME_GRID[-1]))
+    off, most = np.log(p.correlation_time / median), np.log(_TIME_RANGE)
+    low, high = max(_TIME_GRID[0], -most - off), min(_TIME_GRID[-1], most - off)
+    x = float(np.clip(_RELAXATION * find_peak(_TIME_GRID, value), low, high))
     figures.times[p.name] = p.correlation_time * float(np.exp(x))
     for group in groups:
-        figures.log[group] += float(np.interp(x, _TIME_GRID, np.log(grown)))
+        grew = float(np.interp(x, _TIME_GRID, np.log(grown)))
+        figures.log[group] = min(figures.log[group] + grew, figures.get_largest(group))
 
 
 def _weigh_rows(figures: Components, problem: Problem, rows: Constraint, squared: Array) -> None:

@@ -35,7 +35,9 @@ from graphnav.estimation.solvers.passes import MomentPass, SmootherPass
 
 Process = tuple[Array, Array, Array]  # keyframes (n,), A and B (n, k)
 
-_CONTROLLED = 0.01  # redundancy below which nothing can tell whether a row is wrong (Foerstner's limit)
+# redundancy below which nothing can tell whether a row is wrong: what linearisation leaves in a residual, a tenth of a
+# sigma, would look like an error of a whole one
+_CONTROLLED = 0.01
 _FORGOTTEN = 1e-6  # relative remainder of a difference below which it is rounding error
 
 

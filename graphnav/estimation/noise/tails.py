@@ -70,11 +70,16 @@ def estimate_tail_index(squared: Array, m: int) -> float:
     cost = 0.5 * (np.minimum(squared[:, None], index + m) + (index + m) * np.log(over)).sum(axis=0)
     value = -cost - len(squared) * compute_log_normaliser(index, m)
     value -= 0.5 * ((_GRID - np.log(get_tail_index({}, "", m))) / _WITHIN) ** 2
-    j = int(np.clip(np.argmax(value), 1, len(_GRID) - 2))
+    return float(np.exp(find_peak(_GRID, value)))
+
+
+def find_peak(grid: Array, value: Array) -> float:
+    """Where values (n,) on an even grid (n,) are largest, by the parabola through the largest and its neighbours."""
+    j = int(np.clip(np.argmax(value), 1, len(grid) - 2))
     low, here, high = value[j - 1 : j + 2]
     bend = low - 2.0 * here + high
     off = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
-    return float(np.exp(_GRID[j] + (_GRID[1] - _GRID[0]) * np.clip(off, -1.0, 1.0)))
+    return float(grid[j] + (grid[1] - grid[0]) * np.clip(off, -1.0, 1.0))
 
 
 def compute_information_share(index: float, m: int) -> float:
