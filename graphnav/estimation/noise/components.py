@@ -24,7 +24,7 @@ class Squares:
 
     A: float = 0.0  # of squares
     B: float = 0.0  # of redundancies
-    T: float = 0.0  # of their squares
+    T: float = 0.0  # of their squares: tr (P V)^2 of disturbances that are independent
 
     def __add__(self, other: Squares) -> Squares:
         return Squares(self.A + other.A, self.B + other.B, self.T + other.T)
