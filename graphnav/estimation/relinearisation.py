@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav.core.progress import Progress
+from graphnav.core.state import States
 from graphnav.estimation.alignment import Alignment
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.problem import Problem
@@ -19,6 +20,7 @@ from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
     are_near,
+    move_points,
     reuse_points,
     subtract_points,
     take_solution_points,
@@ -29,6 +31,10 @@ from graphnav.estimation.solvers.rts import smooth_backward, smooth_points
 CLEARLY_BETTER = 10.0  # half chi-square; a likelihood ratio of 22,000
 _LINEAR = 0.5  # sigmas of what a step still moves: a mean square of errors over sigmas is a quarter larger
 _SMOOTHINGS = 5  # passes of filter and smoother about their previous points; without convergence a batch is solved
+
+
+class _Worse(Exception):
+    """Raised to end a batch solution that leads to a worse optimum."""
 
 
 def relinearise(
@@ -77,9 +83,14 @@ def linearise_searched(
     """
     initials, spent = find_initial_points(problem, aligned.until)
     passes.update(filter=spent, smoother=spent)
-    optima = [_minimise(problem, one.points, passes) for one in initials]
-    best = min(optima, key=lambda points: compute_cost_at(problem, points))
-    return _linearise_at(problem, aligned, best, progress, passes)
+    starts = [one.points for one in initials]
+    near = [_descend(problem, start, passes) for start in starts]
+    optima = {compute_cost_at(problem, points): points for points in near if points is not None}
+    for start in (start for start, points in zip(starts, near, strict=True) if points is None):
+        with contextlib.suppress(_Worse):
+            points = _solve_batch(problem, start, min(optima, default=np.inf))
+            optima[compute_cost_at(problem, points)] = points
+    return _linearise_at(problem, aligned, optima[min(optima)], progress, passes)
 
 
 def linearise_known(
@@ -128,28 +139,59 @@ def _linearise_far(
 
 
 def _minimise(problem: Problem, start: Points, passes: Counter[str]) -> Points:
-    """The points of least cost, by steps of filter and smoother while they lower it, a fraction of the time of a batch
-    solution; of that from the start where a step raises the cost.
-    """
-    points, cost = start, compute_cost_at(problem, start)
+    """The points of least cost, by steps of filter and smoother, or else by a batch solution, which takes longer."""
+    found = _descend(problem, start, passes)
+    return _solve_batch(problem, start) if found is None else found
+
+
+def _descend(problem: Problem, start: Points, passes: Counter[str]) -> Points | None:
+    """The points of least cost by steps of filter and smoother; None where one raises it."""
+    points, cost, fall = start, compute_cost_at(problem, start), np.inf
     with contextlib.suppress(*BREAKDOWN):
         for _ in range(problem.settings.solver.max_iterations):
-            ahead, before = smooth_points(refilter(problem, points, whole=False)), cost
+            ahead = smooth_points(refilter(problem, points, whole=False))
             passes.update(filter=1, smoother=1)
-            cost = compute_cost_at(problem, ahead)
-            if abs(before - cost) < problem.settings.solver.tolerance:
+            lower = compute_cost_at(problem, ahead)
+            if abs(cost - lower) < problem.settings.solver.tolerance:
                 return ahead
-            if not cost < before:
+            if not 0.0 < cost - lower < 0.5 * fall:  # not the convergence of Gauss and Newton
+                ahead, lower = _shorten(problem, points, ahead, cost, lower)
+            if not lower < cost:
                 break
-            points = ahead
-    return _solve_batch(problem, start)
+            points, cost, fall = ahead, lower, cost - lower
+    return None
 
 
-def _solve_batch(problem: Problem, start: Points) -> Points:
-    """The points of the batch solution that is found from some states."""
+def _shorten(problem: Problem, start: Points, ahead: Points, cost: float, lower: float) -> tuple[Points, float]:
+    """The points on the way from a start to those ahead where the cost is least, by a parabola through its values at
+    both and halfway, and the cost there; those ahead where it is no less.
+    """
+    step = subtract_points(ahead, start)
+    halfway = compute_cost_at(problem, move_points(start, 0.5 * step))
+    bend = cost - 2.0 * halfway + lower
+    if not bend > 0.0:
+        return ahead, lower
+    nearer = move_points(start, (3.0 * cost - 4.0 * halfway + lower) / (4.0 * bend) * step)
+    least = compute_cost_at(problem, nearer)
+    return (nearer, least) if least < lower else (ahead, lower)
+
+
+def _solve_batch(problem: Problem, start: Points, least: float = np.inf) -> Points:
+    """The points of the batch solution that is found from some states.
+
+    Raises
+    ------
+    _Worse
+        If it moves slowly where it costs clearly more than the least of other points, `least`.
+    """
     from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which few filter runs need
 
-    return take_solution_points(problem, batch(problem, start.states, wanted=(), reintegrate=False), start)
+    def watch(states: States, cost: float, gain: float, slow: bool) -> None:
+        if slow and cost - gain > least + CLEARLY_BETTER:
+            raise _Worse
+
+    found = batch(problem, start.states, wanted=(), reintegrate=False, watch=watch)
+    return take_solution_points(problem, found, start)
 
 
 def _linearise_at(

@@ -44,8 +44,8 @@ from graphnav.estimation.solvers.rows import (
 _GRADUATION = 1.4  # by which mu grows from step to step
 _SHARP = 100.0  # mu from which on the kernel bends within half a per cent of its scale
 _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e8
-# of a step: the states it starts from, their cost, by how much it promises to lower that, and whether a damped one
-# before it did not halve it
+# of a step: the states it starts from, their cost, by how much it promises to lower that, and whether two before it had
+# to be shortened or damped and did not halve it
 Callback = Callable[[States, float, float, bool], None]
 
 
@@ -127,6 +127,13 @@ def _graduate(problem: Problem, points: Points) -> Iterator[Problem]:
         mu = {name: _GRADUATION * x for name, x in mu.items()}
 
 
+@dataclass(frozen=True)
+class _Candidate:
+    points: Points
+    rows: WhitenedRows
+    cost: float
+
+
 def _minimise(
     problem: Problem,
     points: Points,
@@ -142,8 +149,8 @@ def _minimise(
     if reintegrate:
         problem, renewed = integrate_again(problem, points.states, scale_at(problem.columns, points.values[0]))
     layout = Layout(problem)
-    rows, now = whiten(problem, points, layout)
-    damping, gentlest, slow = 0.0, _MIN_DAMPING, False
+    here = _evaluate(problem, points, layout)
+    damping, gentlest, slow = 0.0, _MIN_DAMPING, 0
     stopped = f"stopped at the limit of {settings.max_iterations} iterations"
     eliminated: Eliminated | None = None
     iteration = 0
@@ -151,22 +158,18 @@ def _minimise(
         iteration += 1
         if progress is not None:
             progress("batch", iteration / settings.max_iterations)
+        shortened = False
         while True:
-            eliminated, step, gain = solve_rows(rows, layout, damping)
+            eliminated, step, gain = solve_rows(here.rows, layout, damping)
             if watch is not None and damping == 0.0:
-                watch(points.states, now, gain, slow)
-            candidate = _move(points, step)
-            rows_ahead, ahead = whiten(problem, candidate, layout)
-            if ahead < now or gain < settings.tolerance:
+                watch(here.points.states, here.cost, gain, slow > 1)
+            ahead = _evaluate(problem, _move(here.points, step), layout)
+            if gain < settings.tolerance:
                 break
             if damping == 0.0:
-                # a correction of an early heading moves all later positions along tangents, off the track by the square
-                # of the angle; the next step corrects that, so both are assessed together
-                beyond = _move(candidate, solve_rows(rows_ahead, layout)[1])
-                rows_beyond, behind = whiten(problem, beyond, layout)
-                if behind < now:
-                    candidate, rows_ahead, ahead = beyond, rows_beyond, behind
-                    break
+                ahead, shortened = _improve(problem, here, step, gain, ahead, layout)
+            if ahead.cost < here.cost:
+                break
             refused += 1
             damping = max(gentlest, 10.0 * damping)
             if damping > _MAX_DAMPING:
@@ -175,26 +178,27 @@ def _minimise(
             stopped, eliminated = "stopped: no step lowers the cost", None
             break
         if gain < settings.tolerance and damping == 0.0:
-            if ahead < now:
-                points, now = candidate, ahead  # the last small step is free
+            if ahead.cost < here.cost:
+                here = ahead  # the last small step is free
             stopped = f"converged: one more step would lower the cost by {gain:.1e}"
             break
-        slow = damping > 0.0 and ahead > 0.5 * now
-        if ahead < now:
-            points, rows, now = candidate, rows_ahead, ahead
+        slow = slow + 1 if (shortened or damping > 0.0) and ahead.cost > 0.5 * here.cost else 0
+        if ahead.cost < here.cost:
+            here = ahead
         eliminated = None
         # a damped step promises little by construction: convergence is judged by an undamped one
         if damping == gentlest:
             gentlest /= 10.0  # a larger step would have been possible: less damping in a long valley
         damping = 0.0 if damping <= _MIN_DAMPING or gain < settings.tolerance else damping / 10.0
         if reintegrate:
-            problem, again = integrate_again(problem, points.states, scale_at(problem.columns, points.values[0]))
+            scale = scale_at(problem.columns, here.points.values[0])
+            problem, again = integrate_again(problem, here.points.states, scale)
             if again:
                 layout = Layout(problem)
-                rows, now = whiten(problem, points, layout)
+                here = _evaluate(problem, here.points, layout)
                 renewed += again
     if eliminated is None and iterations is None:
-        eliminated = solve_rows(rows, layout)[0]
+        eliminated = solve_rows(here.rows, layout)[0]
     notes = []
     if refused:
         stopped += f" ({refused} steps taken back and damped)"
@@ -205,7 +209,34 @@ def _minimise(
                 f"{format_count(renewed, 'interval')} re-integrated because the gyro bias estimate had changed",
             )
         )
-    return _Minimum(problem, points, layout, eliminated, now, iteration, stopped, tuple(notes))
+    return _Minimum(problem, here.points, layout, eliminated, here.cost, iteration, stopped, tuple(notes))
+
+
+def _evaluate(problem: Problem, points: Points, layout: Layout) -> _Candidate:
+    return _Candidate(points, *whiten(problem, points, layout))
+
+
+def _improve(
+    problem: Problem, here: _Candidate, step: Array, gain: float, ahead: _Candidate, layout: Layout
+) -> tuple[_Candidate, bool]:
+    """Where an undamped step (K, D) leads, or a better candidate if it lowers the cost by less than half of `gain`, its
+    promise; and whether that is a part of a step that would raise the cost.
+    """
+    raises = not ahead.cost < here.cost
+    if raises:
+        # a correction of an early heading moves all later positions along tangents, off the track by the square of the
+        # angle; the next step corrects that, so both are assessed together
+        beyond = _evaluate(problem, _move(ahead.points, solve_rows(ahead.rows, layout)[1]), layout)
+        if beyond.cost < here.cost:
+            return beyond, False
+    if not ahead.cost < here.cost - 0.5 * gain:
+        # to the minimum of the parabola along the step by the cost here, its slope of -2 gain, and the cost ahead
+        # (Nocedal and Wright 2006, eq. 3.58): kernels and turns may double the curvature, and full steps swing
+        part = gain / (ahead.cost - here.cost + 2.0 * gain)
+        nearer = _evaluate(problem, _move(here.points, part * step), layout)
+        if nearer.cost < min(here.cost, ahead.cost):
+            return nearer, raises
+    return ahead, False
 
 
 def _move(points: Points, step: Array) -> Points:
