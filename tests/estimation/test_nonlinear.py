@@ -17,15 +17,16 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError
 from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array, mv
-from graphnav.core.state import DIM
+from graphnav.core.state import DIM, States
 from graphnav.detectors import detect
 from graphnav.detectors.base import Detection
 from graphnav.detectors.scene import Detector
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.factor_graph.nonlinear import get_state, make_graph
 from graphnav.estimation.pipeline import add_own, run
 from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.passes import make_points
-from graphnav.estimation.solvers.rows import Layout, whiten
+from graphnav.estimation.solvers.rows import Layout, compute_cost_at, whiten
 from graphnav.recording import Recording
 from graphnav.sensors import list_sensors
 
@@ -112,6 +113,40 @@ def test_differences_do_what_jacobians_do(drive):
     np.testing.assert_allclose(assemble(found), assemble(exact), rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(found.residual, exact.residual)
     assert "constraint.differences" in map(get_key, problem.notes)
+
+
+@dataclass(frozen=True)
+class Bowl(Constraint):
+    """Heights in a cost of which the rows tell half of the curvature: (x^2 + (100 + 0.0095 x^2 / 2)^2) / 2."""
+
+    name, axes, unit = "bowl", ("height", "depth"), "m"
+    sigma: Array = field(default_factory=lambda: np.empty((0, 2)))
+
+    @classmethod
+    def build(cls, scene):
+        keyframe = np.arange(len(scene.t))
+        return cls(keyframe=keyframe, sigma=np.ones((len(keyframe), 2)))
+
+    def residual(self, states, parameters, rows):
+        x = states.p[:, 2]
+        return np.stack([x, 100.0 + 0.0095 * x**2 / 2.0], axis=1)
+
+
+def test_batch_ends_where_the_cost_is_least_though_full_steps_go_nearly_twice_as_far(drive):
+    start = States(np.eye(3)[None], *np.zeros((4, 1, 3)))
+    sigma = np.repeat([1.0, 1e3, 1.0, 1e-2, 1e-3], 3)
+    problem = build_problem(
+        add_own(drive.crop(0.0, 10.0), [Bowl]), parse_settings(STATED), LocalFrame(drive.gnss.llh[0]), start, sigma
+    )
+    problem = replace(problem, constraints=tuple(c for c in problem.constraints if c.name == "bowl"))
+    states = problem.motion.advance_through(slice(0, len(problem.t) - 1), start, None)
+    solution = batch(problem, States.stack([start, states]).plus(np.eye(DIM)[[5] * len(problem.t)]), wanted=())
+    shift = np.linspace(-0.5, 0.5, 101)[:, None] * np.eye(DIM)[5]
+    costs = [
+        compute_cost_at(problem, make_points(problem, solution.states.plus(np.tile(e, (len(problem.t), 1))), {}))
+        for e in shift
+    ]
+    assert min(costs) > solution.cost - problem.settings.solver.tolerance
 
 
 def test_an_own_detector_suffices_by_itself(drive):
