@@ -33,7 +33,6 @@ from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import Against, read_against, select_own
 from graphnav.recording import ImuNoise, Recording
 from graphnav.recording.exporters import check_names
-from graphnav.recording.plausibility.screening import refuse, screen
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Metrics
@@ -177,11 +176,8 @@ def _solve_request(
     check_names(request.exported, recording.gps_zero)
     if request.point == "antenna" and recording.gnss is None:
         raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
-    with measure_time(timings, "checks"):
-        screened = screen(recording, found.rows)
-        refuse(screened.recording, screened.findings)
-        checks = Checks(recording, screened)
-    recording, moved = screened.recording, shift_spans(request.withheld, zero)
+    checks = Checks(recording, found.rows)
+    recording, moved = found.rows[0], shift_spans(request.withheld, zero)
     used, notes = withhold(recording, moved, zero)
     if is_truth_apart(recording):
         recording = replace(recording, truth=None)
