@@ -14,15 +14,15 @@ from graphnav.core.progress import Progress
 from graphnav.recording import Recording
 
 if TYPE_CHECKING:
-    from graphnav.recording.plausibility.screening import Screened
+    from graphnav.recording.plausibility.screening import ScreenedRows
 
 
 class Checks:
-    """All checks of a recording that was screened, begun beside what follows."""
+    """All checks of a recording whose rows were screened, begun beside what follows."""
 
-    def __init__(self, recording: Recording, screened: Screened) -> None:
-        self._screened, self.seconds = screened.recording, 0.0  # that were waited for them
-        self._work, self._awaited = begin_beside(partial(_check, recording, screened)), False
+    def __init__(self, recording: Recording, rows: ScreenedRows) -> None:
+        self._recording, self.seconds = recording, 0.0  # that were waited for them
+        self._work, self._awaited = begin_beside(partial(_check, recording, rows)), False
 
     def get_findings(self) -> tuple[Finding, ...]:
         """Wait for all findings.
@@ -38,7 +38,7 @@ class Checks:
         findings = self._work.get_result()
         self.seconds += time.perf_counter() - began
         self._awaited = True
-        refuse(self._screened, findings)
+        refuse(self._recording, findings)
         return findings
 
     def await_before(self, stage: str, progress: Progress | None) -> Progress:
@@ -53,9 +53,13 @@ class Checks:
         return listen
 
 
-def _check(recording: Recording, screened: Screened) -> tuple[Finding, ...]:
+def _check(recording: Recording, rows: ScreenedRows) -> tuple[Finding, ...]:
     from graphnav.recording.checks.overview import inspect
+    from graphnav.recording.plausibility.screening import screen
 
+    screened = screen(recording, rows)
+    if any(one.severity == "refused" for one in screened.findings):
+        return screened.findings
     return inspect(recording, screened).findings
 
 

@@ -163,7 +163,8 @@ def detect(
 
     The intervals, the statistics of each detector and a page of figures are written.
     """
-    from graphnav.app import outputs, workflow
+    from graphnav.app import outputs
+    from graphnav.app.reading import AskedPart, read_part
     from graphnav.config import read_settings
     from graphnav.core.staging import resolve_final_path, stage_results
     from graphnav.detectors import detect as detected
@@ -175,18 +176,15 @@ def detect(
     folder = outputs.check_output_folder(out)
     with show_progress(quiet, "detect"):
         tell("reading")
-        used, notes = screen_recording(
-            workflow.read_part(
-                pick_one(context, recording), start, end, withheld, tuple(topic or ()), format, allow_outside
-            )
-        )
+        part = AskedPart(pick_one(context, recording), start, end, tuple(topic or ()), format, allow_outside)
+        used, notes = screen_recording(read_part(part, withheld))
         tell("detection")
         found = detected(used, settings)
         found = replace(found, notes=(*notes, *found.notes))
         tell("writing")
-        with stage_results(folder) as part:
-            files = detection_report.write_detections(used, found, part)
-    files = resolve_final_path(files, part, folder)
+        with stage_results(folder) as staged:
+            files = detection_report.write_detections(used, found, staged)
+    files = resolve_final_path(files, staged, folder)
     print_out(
         lambda: detection_report.format_found(used, found, files),
         lambda: {**detection_report.list_values(used, found), "files": files},

@@ -229,18 +229,25 @@ def _solve_and_write(
     loose: bool = False,
 ) -> None:
     with pause_collector():
+        from graphnav.app.reading import AskedPart, begin_reading
+        from graphnav.core.beside import allow_second_process
+        from graphnav.core.memory import keep_memory
+
+    keep_memory()
+    allow_second_process()
+    part = AskedPart(
+        asked.recording, asked.start, asked.end, tuple(asked.topic or ()), asked.format, asked.allow_outside
+    )
+    reading = begin_reading(part)  # which takes as long as all that is loaded and asked from here on
+    with pause_collector():
         from graphnav.app import convert, outputs, terminal, workflow
         from graphnav.app.summary import tabulate_comparison
         from graphnav.config import read_settings
-        from graphnav.core.beside import allow_second_process
         from graphnav.core.complaints import split_names
-        from graphnav.core.memory import keep_memory
         from graphnav.core.staging import resolve_final_path, stage_results
         from graphnav.evaluation import gates
         from graphnav.recording.exporters import FORMATS
 
-    keep_memory()
-    allow_second_process()
     withheld = collect_withheld(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)
     names = workflow.name_runs(chosen, loose)
@@ -274,17 +281,17 @@ def _solve_and_write(
         judge_arms=not alone, loose=loose,
     )  # fmt: skip
     with show_progress(asked.quiet, *chosen) as progress:
-        outcome = workflow.run_request(request, progress)
+        outcome = workflow.run_request(request, progress, reading)
         tell("writing")
-        with stage_results(folder) as part:
-            files = (outputs.write_run if alone else outputs.write_comparison_files)(outcome, part, asked.pages)
-        files = resolve_final_path(files, part, folder)
+        with stage_results(folder) as staged:
+            files = (outputs.write_run if alone else outputs.write_comparison_files)(outcome, staged, asked.pages)
+        files = resolve_final_path(files, staged, folder)
         if not asked.pages:
             outputs.remove_pages(folder, () if alone else names)
         if exported:  # separately, so that a failing file does not prevent the others
-            with stage_results(folder) as part:
-                more = convert.export_run(outcome, part, exported, point, alone)
-            files += resolve_final_path(more, part, folder)
+            with stage_results(folder) as staged:
+                more = convert.export_run(outcome, staged, exported, point, alone)
+            files += resolve_final_path(more, staged, folder)
     verdicts = gates.judge_all(requirements, tabulate_comparison(outcome, ours=True)) if requirements else []
 
     def make_json() -> dict[str, Any]:

@@ -116,9 +116,10 @@ def write_comparison_files(outcome: Outcome, folder: Path, pages: bool = True) -
 
             library = beside.submit(read_library)  # once, before there are two processes
             detectors = report.draw_detectors(outcome.recording, next(iter(outcome.solutions.values())))
+        provenance = gather_provenance(outcome)  # which reads the files again
+        if pages:
             with suppress(ConfigError):  # each page says what is missing
                 library.result()
-        provenance = gather_provenance(outcome)
     first, *others = select_own(outcome.solutions)
 
     def write(names: Sequence[str]) -> dict[Path, str]:

@@ -5,9 +5,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graphnav.app.checking import Checks, load_solvers
+from graphnav.app.reading import AskedPart, ReadPart, begin_reading, measure_time
 from graphnav.app.scores import Withheld, score
 from graphnav.app.withholding import shift_spans, withhold
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.base import SAME_TIME
-from graphnav.core.beside import Later, begin_beside
+from graphnav.core.beside import Beside, Later, begin_beside
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.interpolation import pick_nearest
@@ -37,8 +36,6 @@ from graphnav.recording.exporters import check_names
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Metrics
-    from graphnav.recording.plausibility.screening import ScreenedRows
-
 
 _SOLVING = "preintegration"  # the stage at which a recording that cannot be solved is refused at the latest
 LOOSE = "-loose"  # suffix of the name of a solution from fixes in place of raw observations
@@ -73,6 +70,11 @@ class Request:
     point: str | None = None  # "antenna", "imu" or a lever arm
     judge_arms: bool = False  # check the signs of lever arms even if nothing is in doubt
     loose: bool = False  # also solve with fixes in place of raw observations
+
+    @property
+    def part(self) -> AskedPart:
+        """What is to be read."""
+        return AskedPart(self.source, self.start, self.end, self.topics, self.format, self.allow_outside)
 
     def select_settings(self, name: str) -> Settings:
         """The settings of the solution of that name."""
@@ -147,8 +149,10 @@ def parse_noise(text: str | None, settings: Settings) -> tuple[Settings, GivenNo
     return settings.model_copy(update={"noise": settings.noise.model_copy(update={"mode": mode})}), given
 
 
-def run_request(request: Request, progress: Progress | None = None) -> Outcome:
-    """Read, check, withhold, solve and score.
+def run_request(
+    request: Request, progress: Progress | None = None, reading: Beside[ReadPart] | Later[ReadPart] | None = None
+) -> Outcome:
+    """Read, check, withhold, solve and score; `reading` is of the request's part, where it was begun before.
 
     Raises
     ------
@@ -156,22 +160,24 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
         In one plain sentence, for anything that cannot be used as it is.
     """
     with send_progress(progress):
-        return _solve_request(request, progress)
+        return _solve_request(request, progress, reading)
 
 
-def _solve_request(request: Request, progress: Progress | None) -> Outcome:
+def _solve_request(
+    request: Request, progress: Progress | None, reading: Beside[ReadPart] | Later[ReadPart] | None
+) -> Outcome:
     from graphnav.recording.checks.stated import is_truth_apart
-    from graphnav.recording.plausibility.screening import refuse, screen
 
     tell("reading")
-    reading = begin_beside(partial(_read_and_screen, request))
+    reading = reading or begin_reading(request.part)
     load_solvers(request.solvers)  # which takes as long
-    recording, rows, zero, timings = reading.get_result()
-    with _measure_time(timings, "checks"):
-        screened = screen(recording, rows)
-        refuse(screened.recording, screened.findings)
-        checks = Checks(recording, screened)
-    recording, moved = screened.recording, shift_spans(request.withheld, zero)
+    found = reading.get_result()
+    recording, zero, timings = found.recording, found.zero, found.timings
+    check_names(request.exported, recording.gps_zero)
+    if request.point == "antenna" and recording.gnss is None:
+        raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
+    checks = Checks(recording, found.rows)
+    recording, moved = found.rows[0], shift_spans(request.withheld, zero)
     used, notes = withhold(recording, moved, zero)
     if is_truth_apart(recording):
         recording = replace(recording, truth=None)
@@ -188,13 +194,13 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     try:
         solutions = run(used, request.settings, request.solvers, checks.await_before(_SOLVING, progress), model)
     except Exception as error:  # where the recording cannot be solved, that comes first
-        found = checks.get_findings()
+        known = checks.get_findings()
         if isinstance(error, EstimationError):
-            raise _name_cause(error, found) from None
+            raise _name_cause(error, known) from None
         raise
-    found = checks.get_findings()
+    known = checks.get_findings()
     timings["checks"] += checks.seconds
-    findings = [f.sentence for f in found]
+    findings = [f.sentence for f in known]
     if request.loose:
         others = run(used, couple_loosely(request.settings), request.solvers, progress, model)
         solutions |= {name + LOOSE: replace(one, solver=name + LOOSE) for name, one in others.items()}
@@ -204,11 +210,11 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     solutions = {
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
-    known = _mitigate(found, solutions)
+    known = _mitigate(known, solutions)
     look = partial(_find_wrong_arms, used, known, dict(solutions))
     looking = begin_beside(look) if request.judge_arms else Later(look)  # which takes a second
     solutions |= _read_others(request, recording, solutions)
-    with _measure_time(timings, "evaluation"):
+    with measure_time(timings, "evaluation"):
         try:
             metrics, against, names = score(recording, used, solutions, moved)
         except RecordingError as error:
@@ -310,67 +316,3 @@ def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
                 "without a row in this recording",
             )
     return notes
-
-
-def read_part(
-    source: str,
-    start: float | None = None,
-    end: float | None = None,
-    withheld: tuple[Withheld, ...] = (),
-    topics: tuple[str, ...] = (),
-    name: str | None = None,
-    allow_outside: bool = False,
-) -> Recording:
-    """The requested part of a recording, without what is withheld; times in s from the recording's start.
-
-    `topics`, `name` and `allow_outside` are those of `graphnav.recording.formats.read`.
-
-    Raises
-    ------
-    GraphnavError
-        In one plain sentence, if it cannot be read or there is no such part.
-    """
-    from graphnav.recording.formats import read
-
-    whole = read(source, topics, allow_outside, name)
-    part = _crop(whole, Request(source, (), start=start, end=end))
-    zero = part.start - whole.start if part is not whole else 0.0
-    return withhold(part, shift_spans(withheld, zero), zero)[0]
-
-
-def _read_and_screen(request: Request) -> tuple[Recording, ScreenedRows, float, dict[str, float]]:
-    """The requested part of the recording, as read and its rows screened, its start from that of the whole, s, and
-    timings.
-    """
-    from graphnav.recording.formats import read
-    from graphnav.recording.plausibility.screening import screen_rows
-
-    timings: dict[str, float] = {}
-    with _measure_time(timings, "reading"):
-        whole = read(request.source, request.topics, request.allow_outside, request.format)
-    check_names(request.exported, whole.gps_zero)
-    if request.point == "antenna" and whole.gnss is None:
-        raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
-    part = _crop(whole, request)
-    with _measure_time(timings, "checks"):
-        rows = screen_rows(part)
-    return part, rows, part.start - whole.start if part is not whole else 0.0, timings
-
-
-@contextmanager
-def _measure_time(timings: dict[str, float], stage: str) -> Iterator[None]:
-    tell(stage)
-    began = time.perf_counter()
-    yield
-    timings[stage] = timings.get(stage, 0.0) + time.perf_counter() - began
-
-
-def _crop(whole: Recording, request: Request) -> Recording:
-    """The requested part of the recording."""
-    if (request.start or 0.0) >= whole.duration or (request.end is not None and request.end <= 0.0):
-        option = f"--start {request.start:g}" if (request.start or 0.0) >= whole.duration else f"--end {request.end:g}"
-        raise RecordingError(
-            f"{option}: lies outside '{whole.name}', which runs from 0 to {whole.duration:.1f} s",
-            key="option.span_outside",
-        )
-    return whole.crop(request.start, request.end)

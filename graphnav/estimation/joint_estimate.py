@@ -114,6 +114,26 @@ def begin_jointly(
     ----------
     start : initial figures, of nearly the same measurements.
     """
+    return free_contradicted(estimate_as_stated(stated, opening, progress, start), settings, opening, progress)
+
+
+def estimate_as_stated(
+    stated: Problem, opening: float | None = None, progress: Progress | None = None, start: NoiseModel | None = None
+) -> JointEstimate:
+    """The same with all constants as stated."""
+    first = estimate_noise(stated, opening, start, progress=progress)
+    other = _estimate_with_worse_imu(stated, first, opening, progress)
+    if other is None:
+        return JointEstimate(stated, {}, first)
+    if other.log_evidence <= first.log_evidence + first.gained_by_chance:
+        return JointEstimate(stated, {}, replace(first, passes=first.passes + other.passes))
+    return JointEstimate(stated, {}, other, rival=JointEstimate(stated, {}, first))
+
+
+def free_contradicted(
+    found: JointEstimate, settings: GnssSettings, opening: float | None = None, progress: Progress | None = None
+) -> JointEstimate:
+    """The same with the constants free that the drive contradicts."""
 
     def estimate(base: Problem, before: JointEstimate, start: NoiseModel | None = None) -> NoiseEstimate:
         near = before.estimate.get_linearisation(before.base)
@@ -122,16 +142,12 @@ def begin_jointly(
     def go_on(base: Problem, before: JointEstimate) -> NoiseEstimate:
         return estimate(base, before, before.estimate.noise)
 
-    def free_in(one: NoiseEstimate) -> JointEstimate:
-        return _free_constants(JointEstimate(stated, {}, one), settings, go_on, estimate)
-
-    first = estimate_noise(stated, opening, start, progress=progress)
-    other = _estimate_with_worse_imu(stated, first, opening, progress)
-    if other is None:
-        return free_in(first)
-    if other.log_evidence <= first.log_evidence + first.gained_by_chance:
-        return free_in(replace(first, passes=first.passes + other.passes))
-    return replace(free_in(other), rival=free_in(first))
+    one, rival = (
+        None if one is None else _free_constants(replace(one, rival=None), settings, go_on, estimate)
+        for one in (found, found.rival)
+    )
+    assert one is not None
+    return replace(one, rival=rival)
 
 
 def _estimate_with_worse_imu(

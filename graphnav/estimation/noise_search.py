@@ -24,8 +24,9 @@ from graphnav.detectors.base import NONE
 from graphnav.estimation.building import BuiltProblem, ProblemBuilder
 from graphnav.estimation.joint_estimate import (
     JointEstimate,
-    begin_jointly,
+    estimate_as_stated,
     estimate_jointly,
+    free_contradicted,
     leave_out_jointly,
     revise_jointly,
 )
@@ -63,7 +64,18 @@ def begin_noise(
     EstimationError
         If the filter breaks down.
     """
-    return built, begin_jointly(built.problem, builder.settings.gnss, built.aligned.until, progress, start)
+    return free_wrong_constants(builder, estimate_first(built, progress, start), progress)
+
+
+def estimate_first(built: BuiltProblem, progress: Progress | None, start: NoiseModel | None = None) -> Estimated:
+    """The same with all constants as stated."""
+    return built, estimate_as_stated(built.problem, built.aligned.until, progress, start)
+
+
+def free_wrong_constants(builder: ProblemBuilder, first: Estimated, progress: Progress | None) -> Estimated:
+    """The same with the constants free that the drive contradicts."""
+    built, found = first
+    return built, free_contradicted(found, builder.settings.gnss, built.aligned.until, progress)
 
 
 def leave_out_contradicted_stops(

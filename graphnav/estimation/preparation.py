@@ -40,7 +40,13 @@ from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.tails import widen_by_tails, widen_unweighted
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_in_gaps, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
-from graphnav.estimation.noise_search import Weigh, begin_noise, find_noise, leave_out_contradicted_stops
+from graphnav.estimation.noise_search import (
+    Weigh,
+    estimate_first,
+    find_noise,
+    free_wrong_constants,
+    leave_out_contradicted_stops,
+)
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.relinearisation import is_clearly_worse, linearise_known, linearise_searched, relinearise
@@ -210,10 +216,14 @@ def begin_preparation(
         return Begun(recording, unmeasured, builder, built, noise, None, spacing, larger, passes)
     tell("noise")
     with clock.count_time("noise"):
-        one = begin_noise(builder, built, progress, None if before is None else before.figures)
+        one = estimate_first(built, progress, None if before is None else before.figures)
         if before is not None and before.foreseen is not None:
             before.foreseen.passes.end()  # for what takes its place
         foreseen = _foresee(*one)
+        one = free_wrong_constants(builder, one, progress)
+        if foreseen is not None and one[1].freed:
+            foreseen.passes.end()
+            foreseen = None
         false_stops, (built, found) = leave_out_contradicted_stops(builder, one, progress, passes)
     builder = replace(builder, false_stops=false_stops)
     return Begun(recording, unmeasured, builder, built, None, found, spacing, larger, passes, foreseen)
@@ -302,7 +312,7 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
 
 def _foresee(built: BuiltProblem, found: JointEstimate) -> Foreseen | None:
     """Begin the filter with the noise model of all measurements, where another is not likely already."""
-    if found.freed or found.rival is not None or not may_begin():
+    if found.rival is not None or not may_begin():
         return None
     noise = widen_by_tails(found.base, found.noise)
     problem = drop_parts(apply_noise(found.base, noise))

@@ -15,6 +15,7 @@ from graphnav.config import parse_settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET
 from graphnav.constraints.odometer import ODOMETER_DELAY
+from graphnav.core import beside
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import get_key
@@ -89,6 +90,17 @@ def test_a_drive_with_a_wrong_arm_is_solved_as_with_the_right_one(drive, right, 
         assert (np.abs(one.value[-1] - ARM)[freed] < 4.0 * one.sigma[-1][freed]).all()
         assert "gnss.lever_arm_used" in map(get_key, wrong[name].notes)
         assert not stated[name].noise.freed
+
+
+@pytest.mark.parametrize("wrong", ["arm", ""])
+def test_a_second_process_changes_no_solution(drive, right, solved, monkeypatch, wrong):
+    """It filters with all constants as stated, before these are tested."""
+    recording, alone = solved(wrong) if wrong else (drive, right)
+    monkeypatch.setattr(beside, "_allowed", True)
+    together = run(recording, solvers=("ekf", "rts"))
+    for name in ("ekf", "rts"):
+        np.testing.assert_array_equal(together[name].states.p, alone[name].states.p)
+        np.testing.assert_array_equal(together[name].covariance, alone[name].covariance)
 
 
 def stretch_stamps(recording, rate):

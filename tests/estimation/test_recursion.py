@@ -233,3 +233,13 @@ def test_turns_one_behind_the_other() -> None:
         both = rotation.exp(first) @ rotation.exp(then)
         found = recursion.compose_turns(rotation.to_quaternion(rotation.exp(first)), then)
         np.testing.assert_allclose(found, rotation.log(both), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", range(1, 10))  # with every number of rows that fours leave
+def test_a_covariance_times_what_was_divided_by_it(size: int) -> None:
+    rng = np.random.default_rng(size)
+    half = rng.standard_normal((size, size))
+    P, X = half @ half.T + np.eye(size), rng.standard_normal((size, 3))
+    found = X.copy()
+    recursion.divide_covariance(P, found)
+    np.testing.assert_allclose(P @ found, X, rtol=0.0, atol=1e-12)

@@ -18,9 +18,10 @@ import numpy as np
 import graphnav
 from graphnav.app import outputs
 from graphnav.app.fleet.manifest import Task
+from graphnav.app.reading import AskedPart, read_part
 from graphnav.app.summary import compute_median_sigmas, summarise_solver
 from graphnav.app.withholding import parse_withheld
-from graphnav.app.workflow import Outcome, Request, parse_noise, read_part, run_request
+from graphnav.app.workflow import Outcome, Request, parse_noise, run_request
 from graphnav.config.files import parse_settings
 from graphnav.core.errors import GraphnavError
 from graphnav.core.files import check_regular, hash_file, parse_json, read_text
@@ -141,7 +142,7 @@ def _make_request(task: Task) -> Request:
     noise = parse_noise(task.noise, settings)[1] if task.noise else None
     withheld = tuple(parse_withheld(one) for one in task.without)
     if task.withhold is not None:
-        part = read_part(task.source, task.start, task.end, allow_outside=task.allow_outside)
+        part = read_part(AskedPart(task.source, task.start, task.end, allow_outside=task.allow_outside))
         withheld += tuple(("gnss", span) for span in choose_spans(part, task.withhold, task.start or 0.0))
     given = {"recording": task.source, "solver": task.solver, "fleet": True, "withhold": task.withhold}
     return Request(

@@ -71,7 +71,7 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
     smoothed: SmootherPass | None = None
     try:
         for _ in range(_SEARCHES):
-            found = weigh_rows(problem, refilter(problem, about, watch=True, drifts=False).weights)
+            found = weigh_rows(problem, refilter(problem, about, watch=True, drifts=False, whole=False).weights)
             if _list_unused(found) == _list_unused(sound):
                 break
             sound, smoothed = found, smooth_near(found, about, opening)

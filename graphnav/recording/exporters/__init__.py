@@ -51,17 +51,18 @@ def write_parts(
     try:
         with ExitStack() as stack:
             adders = []
-            for one, part in zip(targets, parts.values(), strict=True):
-                module = import_module(f"graphnav.recording.exporters.{one}")
+            for kind, part in zip(targets, parts.values(), strict=True):
+                module = import_module(f"graphnav.recording.exporters.{kind}")
                 adders.append(stack.enter_context(module.open_writer(part, name)))
-            pool = stack.enter_context(ThreadPoolExecutor(1))
-            writing: Future[None] | None = None
+            pool = stack.enter_context(ThreadPoolExecutor(2))
+            writing: list[Future[None]] = []
             for block in blocks:  # the next one is computed while one is written
-                if writing is not None:
-                    writing.result()
-                writing = pool.submit(_add_to_all, adders, block, utc)
-            if writing is not None:
-                writing.result()
+                for one in writing:
+                    one.result()
+                stamps = None if utc is None else utc(block.t)
+                writing = [pool.submit(add, block, stamps) for add in adders]
+            for one in writing:
+                one.result()
         for path, part in parts.items():
             os.replace(part, path)
     except RecordingError as error:
@@ -72,12 +73,6 @@ def write_parts(
     finally:
         for part in parts.values():
             part.unlink(missing_ok=True)
-
-
-def _add_to_all(adders: Sequence[Add], block: Trajectory, utc: Callable[[Array], Array] | None) -> None:
-    stamps = None if utc is None else utc(block.t)
-    for add in adders:
-        add(block, stamps)
 
 
 def check_names(names: Sequence[str], gps_zero: float | None) -> None:
