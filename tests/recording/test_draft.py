@@ -16,10 +16,12 @@ from graphnav.app import cli
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import exp
 from graphnav.recording.checks.overview import inspect
+from graphnav.recording.densities import estimate_density_in_motion, measure_densities
 from graphnav.recording.draft import draft, guesses, motion
 from graphnav.recording.draft.agreement import find_level_axes
 from graphnav.recording.formats import columns, read
 from graphnav.recording.formats.axes import parse_axes_letters
+from graphnav.simulation import simulate
 
 DRIVE, _ = oracle.drive(
     oracle.vehicle_path(240.0, 50.0), seed=3, gnss_rate=5.0, gnss_velocity_sd=(0.05, 0.05, 0.1), odometer_rate=20.0
@@ -135,7 +137,31 @@ def test_rates_in_no_unit_are_refused_only_as_counts():
 def test_white_noise_is_measured():
     rng = np.random.default_rng(2)
     t = np.arange(60000) / 100
-    assert guesses.estimate_noise_density(t, rng.normal(0, 0.02, (60000, 3))) == pytest.approx(0.002, rel=0.25)
+    assert estimate_density_in_motion(t, rng.normal(0, 0.02, (60000, 3))) == pytest.approx(0.002, rel=0.25)
+
+
+@pytest.mark.parametrize("rest", [0.0, 5.0])
+def test_noise_of_a_walk_is_that_of_its_sensors_not_of_its_steps(rest):
+    """Stances of half a second show it where nothing else does."""
+    t = 0.005 * np.arange(1, 8001)
+    swing = (t > rest) & (t % 1.1 > 0.5)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        steps = swing[:, None] * rng.normal(0.0, 3.0, (len(t), 3))
+        gyro, accel = (s / np.sqrt(0.005) * rng.standard_normal((len(t), 3)) + steps for s in (5e-4, 2e-3))
+        found = measure_densities(t, gyro, accel, walks=True)
+        assert 0.9 < found["gyro_noise_density"] / 5e-4 < 2.0
+        assert 0.9 < found["accel_noise_density"] / 2e-3 < 2.0
+    assert measure_densities(t[:40], gyro[:40], accel[:40], walks=True) == {}  # too short
+
+
+def test_a_walk_is_drafted_with_the_noise_of_its_sensors(tmp_path):
+    made = simulate("gait", 1, duration=20.0)
+    made.write(tmp_path / "walk")
+    noise = tomllib.loads(draft([tmp_path / "walk" / "imu.csv.gz"], tmp_path).text)["imu"]["noise"]
+    true = made.recording.imu.noise
+    assert 1.0 < noise["gyro_noise_density"] / true.gyro_noise_density < 3.0
+    assert 1.0 < noise["accel_noise_density"] / true.accel_noise_density < 3.0
 
 
 # ---- motion
