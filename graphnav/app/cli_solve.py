@@ -240,7 +240,6 @@ def _solve_and_write(
         from graphnav.recording.exporters import FORMATS
 
     keep_memory()
-    allow_second_process()
     withheld = collect_withheld(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)
     names = workflow.name_runs(chosen, loose)
@@ -273,7 +272,7 @@ def _solve_and_write(
         topics=tuple(asked.topic or ()), format=asked.format, allow_outside=asked.allow_outside, against=tuple(against),
         judge_arms=not alone, loose=loose,
     )  # fmt: skip
-    with show_progress(asked.quiet, *chosen) as progress:
+    with show_progress(asked.quiet, *chosen) as progress, allow_second_process():
         outcome = workflow.run_request(request, progress)
         tell("writing")
         with stage_results(folder) as part:

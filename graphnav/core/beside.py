@@ -16,8 +16,8 @@ import signal
 import sys
 import warnings
 import weakref
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cached_property, partial
 from typing import Any, Generic, TypeVar
 
@@ -32,10 +32,15 @@ _PARENT_DEATH_SIGNAL = 1  # of prctl(2)
 _allowed = False
 
 
-def allow_second_process() -> None:
-    """Let work be done in a second process from now on."""
+@contextmanager
+def allow_second_process() -> Iterator[None]:
+    """Let work be done in a second process within this context."""
     global _allowed
-    _allowed = True
+    before, _allowed = _allowed, True
+    try:
+        yield
+    finally:
+        _allowed = before
 
 
 def may_begin() -> bool:
