@@ -363,3 +363,17 @@ def test_a_call_of_run_takes_one_name_and_says_what_it_cannot_take():
         run("data/tokyo")  # type: ignore[arg-type]
     with refused("run.argument", ConfigError, "Settings", "dict"):
         run(recording, {"gnss": {"robust": "cauchy"}})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("values", "key", "names"),
+    [
+        ({"gnsss": {}}, "key.unknown", ("'gnsss'", "'gnss'")),
+        ({"gnss": {"robst": "cauchy"}}, "key.unknown", ("'gnss.robst'", "'robust'")),
+        ({"keyframes": {"rate": -1}}, "key.value", ("'keyframes.rate' = -1", "Hz")),
+    ],
+)
+def test_settings_made_in_python_are_refused_in_the_words_of_files(values, key, names):
+    with refused(key, ConfigError, "Settings", *names) as caught:
+        Settings(**values)
+    assert len(str(caught.value).splitlines()) == 1
