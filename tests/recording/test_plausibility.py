@@ -327,6 +327,19 @@ def test_reach_grows_with_the_time_between_fixes() -> None:
     assert np.flatnonzero(find_out_of_reach(t, p)).tolist() == [2]
 
 
+@pytest.mark.parametrize("sigma", [100.0, 200.0, 300.0])
+def test_noise_is_no_fix_out_of_reach(sigma: float) -> None:
+    """However far it scatters; and what lies beyond it still is."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        t = 0.2 * np.arange(660)
+        p = np.outer(t, [10.0, 5.0, 0.0]) + rng.normal(0.0, sigma, (660, 3))
+        assert not find_out_of_reach(t, p).any()
+        wrong = rng.choice(np.arange(5, 655), 60, replace=False)
+        p[wrong] += 1e5
+        assert np.array_equal(np.flatnonzero(find_out_of_reach(t, p)), np.sort(wrong))
+
+
 def test_fixes_of_two_places_are_not_trusted(tokyo: Recording) -> None:
     def thirds(llh: np.ndarray) -> np.ndarray:
         llh[:200, 1] -= 1.0

@@ -18,6 +18,7 @@ from graphnav.recording import Gnss, Recording, take_rows
 FASTEST = 150.0  # m/s; the fastest cars that can be bought reach 490 km/h, 136 m/s
 # A receiver cannot follow a reflection that comes more than one and a half code chips late (GPS C/A: 293 m a chip).
 MISLED = 440.0  # m
+_IMPROBABLE = 5.0 * np.sqrt(2.0)  # ratio of a distance between two fixes to their scatter
 _CACHED = 60.0  # s; a receiver that is switched on outputs fixes at least that often
 _FROZEN = (60.0, 300.0)  # s, and m driven: within these a road or receiver noise changes a height
 _STEEPEST = 0.1  # steepest road: bound on the deviation of a height
@@ -91,13 +92,27 @@ def _compute_positions(gnss: Gnss) -> Array:
 
 
 def find_out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
-    """Fixes at p (M, 3) m, t (M,) s, that cannot be reached from the largest consistent set."""
+    """Fixes at p (M, 3) m, t (M,) s, that cannot be reached from the largest consistent set.
+
+    Where that set itself scatters so much that its fixes may be as far apart, it is the noise, and no fix is wrong.
+    """
+    error = MISLED
+    while True:
+        lost = _find_unreachable(t, p, error)
+        scatter = _measure_scatter(t[~lost], p[~lost])
+        if not lost.any() or not _IMPROBABLE * scatter > error:
+            return lost
+        error = _IMPROBABLE * scatter  # of a set from which less is cut, so that it scatters more
+
+
+def _find_unreachable(t: Array, p: Array, error: float) -> NDArray[np.bool_]:
+    """Fixes outside the largest set in which each is reached from the one before, with `error` m between them."""
     lost = np.zeros(len(t), dtype=bool)
     there = np.flatnonzero(np.isfinite(p).all(axis=1))
     if len(there) < 3:
         return lost
     t, p = t[there], p[there]
-    far = np.linalg.norm(np.diff(p, axis=0), axis=1) > FASTEST * np.diff(t) + MISLED
+    far = np.linalg.norm(np.diff(p, axis=0), axis=1) > FASTEST * np.diff(t) + error
     if not far.any():
         return lost
     edges = np.r_[0, np.flatnonzero(far) + 1, len(t)]
@@ -106,7 +121,7 @@ def find_out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
     best, before = (last - first + 1).astype(float), np.full(len(first), -1)
     for k in range(1, len(first)):
         apart = np.linalg.norm(p[first[k]] - p[last[:k]], axis=1)
-        count = np.where(apart <= FASTEST * (t[first[k]] - t[last[:k]]) + MISLED, best[:k], 0.0)
+        count = np.where(apart <= FASTEST * (t[first[k]] - t[last[:k]]) + error, best[:k], 0.0)
         if count.max() > 0.0:
             before[k] = int(np.argmax(count))
             best[k] += count.max()
@@ -147,11 +162,20 @@ def find_frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
     ]
 
 
-def _compute_steps(gnss: Gnss) -> tuple[Array, float, NDArray[np.bool_]]:
+def _compute_steps(t: Array) -> tuple[Array, float, NDArray[np.bool_]]:
     """Time steps, their median, and which are not gaps."""
-    dt = np.diff(gnss.t)
-    period = float(np.median(dt))
+    dt = np.diff(t)
+    period = float(np.median(dt)) if len(dt) else np.nan
     return dt, period, dt < 1.9 * period
+
+
+def _measure_scatter(t: Array, p: Array) -> float:
+    """Standard deviation (m) per horizontal axis of fixes at p (M, 3) about their neighbours; NaN of too few."""
+    near = _compute_steps(t)[2]
+    bend = (p[2:] - 2.0 * p[1:-1] + p[:-2])[near[1:] & near[:-1], :2]
+    bend = bend[np.isfinite(bend).all(axis=1)]
+    # white errors of s have second differences of s sqrt(6)
+    return float(np.median(np.abs(bend))) / 0.6745 / np.sqrt(6.0) if len(bend) >= 10 else float("nan")
 
 
 def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
@@ -159,13 +183,8 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
     changed.
     """
     sd = float(np.median(gnss.sd[:, :2]))
-    _, period, near = _compute_steps(gnss)
-    pairs = near[1:] & near[:-1]
-    bend = (p[2:] - 2.0 * p[1:-1] + p[:-2])[pairs, :2]
-    bend = bend[np.isfinite(bend).all(axis=1)]
-    # white errors of s have second differences of s sqrt(6)
-    scatter = float(np.median(np.abs(bend))) / 0.6745 / np.sqrt(6.0) if len(bend) >= 10 else float("nan")
-    driven = _ACCELERATION * period**2 / np.sqrt(6.0)
+    scatter = _measure_scatter(gnss.t, p)
+    driven = _ACCELERATION * _compute_steps(gnss.t)[1] ** 2 / np.sqrt(6.0)
     if sd < _FINEST_PHASE:
         yield Finding(
             "warning",
@@ -204,7 +223,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     if there.sum() < 2 * _MEAN_OF:
         return
     gnss, p = take_rows(gnss, there), p[there, :2]
-    dt, period, _ = _compute_steps(gnss)
+    dt, period, _ = _compute_steps(gnss.t)
     jump = _find_jumps(p, dt)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
     # the speed changes by the grip of tyres over half the window; steps over a long gap are not used
