@@ -235,6 +235,16 @@ def test_a_dead_axis_on_a_foot_is_refused(shared_data: Path) -> None:
     assert found(late.crop(0.0, 0.45 * walk.duration)) == {}  # which the sentence proposes
 
 
+@pytest.mark.parametrize("sensor", ["accel", "gyro"])
+def test_a_dead_sensor_is_refused(tokyo: Recording, sensor: str) -> None:
+    def still(x: np.ndarray) -> np.ndarray:
+        return np.tile([0.0, 0.0, 9.8] if sensor == "accel" else np.zeros(3), (len(x), 1))
+
+    assert found(change(tokyo, "imu", **{sensor: still}))["imu.dead_axis"] == "refused"
+    stands = replace(tokyo.crop(26.0, 48.0), odometer=None, gnss=None)  # where a coarse one may read nothing
+    assert "imu.dead_axis" not in found(change(stands, "imu", **{sensor: still}))
+
+
 def test_an_axis_that_rests_with_the_others_is_not_dead(tokyo: Recording) -> None:
     coarse = change(tokyo, "imu", gyro=lambda x: np.round(x / 0.02) * 0.02)  # it then stands still for half a minute
     still = np.diff(coarse.imu.gyro[:, 0]) == 0.0
@@ -435,6 +445,17 @@ def test_sigmas_that_are_all_zero_or_below_it_are_refused(tmp_path: Path, sd: tu
         choose_sigmas(
             table(tmp_path, *sd), ("sd_e", "sd_n", "sd_u"), None, (1.0, 1.0, 1.0), "GNSS position", every, Notes()
         )
+
+
+def test_a_place_that_is_held_is_no_group(tokyo: Recording) -> None:
+    """Ten seconds of one place while the car drives, and then the stop."""
+    drive = tokyo.crop(0.0, 60.0)
+
+    def hold(llh: np.ndarray) -> np.ndarray:
+        llh[50:100] = llh[50]
+        return llh
+
+    assert "gnss.two_groups" not in found(change(drive, "gnss", llh=hold))
 
 
 @pytest.mark.parametrize("which", ["mixed", "block"])

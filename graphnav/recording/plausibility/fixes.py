@@ -220,6 +220,7 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
 def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     """Fixes that alternate between two places a constant step apart, which leaves open which are right."""
     there: NDArray[np.bool_] = np.asarray(np.isfinite(p).all(axis=1))
+    there[1:] &= (np.diff(gnss.llh, axis=0) != 0.0).any(axis=1)  # a place that is held is no group
     if there.sum() < 2 * _MEAN_OF:
         return
     gnss, p = take_rows(gnss, there), p[there, :2]
