@@ -447,6 +447,23 @@ def test_sigmas_that_are_all_zero_or_below_it_are_refused(tmp_path: Path, sd: tu
         )
 
 
+@pytest.mark.parametrize("value", [0.0, 7.0])
+def test_velocities_that_were_not_logged_are_not_used(tokyo: Recording, value: float) -> None:
+    same = change(tokyo, "gnss", v=lambda v: np.full_like(v, value))
+    assert found(same)["gnss.velocity_constant"] == "warning"
+    assert screen(same).recording.gnss.v is None
+    stands = change(tokyo.crop(26.0, 48.0), "gnss", v=np.zeros_like)
+    assert "gnss.velocity_constant" not in found(stands)
+
+
+@pytest.mark.parametrize("value", [0.0, 5.0])
+def test_an_odometer_that_never_changes_is_not_used(tokyo: Recording, value: float) -> None:
+    same = change(tokyo, "odometer", speed=lambda x: np.full_like(x, value))
+    assert found(same)["odometer.constant"] == "warning"
+    assert screen(same).recording.odometer is None
+    assert "odometer.constant" not in found(change(tokyo.crop(30.0, 48.0), "odometer", speed=np.zeros_like))
+
+
 def test_a_place_that_is_held_is_no_group(tokyo: Recording) -> None:
     """Ten seconds of one place while the car drives, and then the stop."""
     drive = tokyo.crop(0.0, 60.0)

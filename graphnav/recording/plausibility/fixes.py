@@ -25,6 +25,7 @@ _STEEPEST = 0.1  # steepest road: bound on the deviation of a height
 _FINEST_PHASE = 1e-3  # m: a two-hundredth of the carrier's wavelength (0.19 m), the resolution of its phase
 _WAVE = 0.19  # m, of L1
 _ACCELERATION = 2.0  # m/s^2, typical acceleration of vehicles
+_WANDER = 30.0  # m, by which fixes of a place may wander
 _UNBELIEVED = 10.0  # ratio to the scatter of adjacent fixes that no true sigma has: errors last, scatter is smaller
 _SMOOTH = 2e-3  # of the sigma; filtered fixes of phones scatter by five thousandths
 GRIP = 8.0  # m/s^2, grip of tyres
@@ -57,6 +58,10 @@ def screen_fixes(recording: Recording) -> tuple[Recording, list[Finding]]:
         findings.append(_drop_unreachable(gnss, p, off, recording.start))
         gnss = take_rows(gnss, ~off)
         p = _compute_positions(gnss)
+    if (away := _measure_misled(gnss, p)) > _WANDER:
+        words = f"the fixes state the same velocity throughout and move otherwise, by {away:.3g} m"
+        findings.append(Finding("warning", f"{words}: it was not logged; not used", "gnss.velocity_constant"))
+        gnss = replace(gnss, v=None, sd_v=None)
     for a, b in find_frozen_heights(gnss, p):
         driven = float(np.hypot(*np.diff(p[a:b, :2], axis=0).T).sum())
         sd = gnss.sd.copy()
@@ -77,6 +82,18 @@ def screen_fixes(recording: Recording) -> tuple[Recording, list[Finding]]:
         findings += check_two_groups(gnss, p)
         findings += check_arrival_stamps(gnss, p)
     return replace(recording, gnss=gnss), findings
+
+
+def _measure_misled(gnss: Gnss, p: Array) -> float:
+    """Distance (m) of a tenth of the fixes from where a velocity that is the same in all leads, beyond their sigmas."""
+    if gnss.v is None:
+        return 0.0
+    known = np.isfinite(gnss.v[:, :2]).all(axis=1) & np.isfinite(p).all(axis=1)
+    if known.sum() < 10 or np.ptp(gnss.v[known][:, :2], axis=0).any():
+        return 0.0
+    off = p[known, :2] - np.outer(gnss.t[known], gnss.v[known][0, :2])
+    sd = float(np.median(gnss.sd[known, :2]))
+    return max(float(np.percentile(np.linalg.norm(off - np.median(off, axis=0), axis=1), 90.0)) - 5.0 * sd, 0.0)
 
 
 def count_cached_fixes(t: Array, start: float) -> int:
