@@ -184,7 +184,7 @@ def detect(
         found = detected(used, settings)
         found = replace(found, notes=(*notes, *found.notes))
         tell("writing")
-        with stage_results(folder) as part:
+        with stage_results(folder, used.files) as part:
             files = detection_report.write_detections(used, found, part)
     files = resolve_final_path(files, part, folder)
     print_out(

@@ -275,13 +275,14 @@ def _solve_and_write(
     with show_progress(asked.quiet, *chosen) as progress, allow_second_process():
         outcome = workflow.run_request(request, progress)
         tell("writing")
-        with stage_results(folder) as part:
+        inputs = (*outcome.recording.files, *(one.path for one in against))
+        with stage_results(folder, inputs) as part:
             files = (outputs.write_run if alone else outputs.write_comparison_files)(outcome, part, asked.pages)
         files = resolve_final_path(files, part, folder)
         if not asked.pages:
             outputs.remove_pages(folder, () if alone else names)
         if exported:  # separately, so that a failing file does not prevent the others
-            with stage_results(folder) as part:
+            with stage_results(folder, inputs) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)
             files += resolve_final_path(more, part, folder)
     verdicts = gates.judge_all(requirements, tabulate_comparison(outcome, ours=True)) if requirements else []

@@ -52,7 +52,7 @@ def solve_drive(task: Task) -> FleetRow:
         if not task.again and (there := read_row(folder, key)) is not None:
             return {**there, "drive": task.name, "source": task.source, "skipped": True}
         outcome = run_request(_make_request(task))
-        with stage_results(folder) as part:
+        with stage_results(folder, outcome.recording.files) as part:
             outputs.write_run(outcome, part, task.pages)
         if not task.pages:
             outputs.remove_pages(folder)
