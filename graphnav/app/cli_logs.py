@@ -165,7 +165,7 @@ def allan(
 
 @commands.command(epilog="\b\nExample:\n  graphnav init imu.csv ride.nmea -o recording.toml")
 def init(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="CSV files, known logs, or a folder of them.")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="CSV files, known logs, or a folder of them.")],
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The .toml to write, or its folder.")] = Path(
         "recording.toml"
     ),
