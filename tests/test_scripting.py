@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import pty
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -248,6 +250,27 @@ def test_a_staged_folder_replaces_at_the_end_or_not_at_all(tmp_path):
     assert not (tmp_path / "x").exists()
 
 
+def test_what_was_read_is_not_replaced(tmp_path, capsys):
+    """A truth, a trajectory to compare with or to convert, of the name of a result, in the folder of the results."""
+    shutil.copytree(TOKYO, tmp_path, dirs_exist_ok=True)
+    truth = tmp_path / "trajectory.csv"
+    truth.write_bytes(gzip.decompress((tmp_path / "truth.csv.gz").read_bytes()))
+    text = (tmp_path / "recording.toml").read_text()
+    (tmp_path / "recording.toml").write_text(text.replace('"truth.csv.gz"', '"trajectory.csv"'))
+    other = tmp_path / "out" / "ekf" / "trajectory.csv"
+    other.parent.mkdir(parents=True)
+    other.write_text("t,lat,lon,h\n" + "".join(f"{1580 + k},35.65,139.77,40\n" for k in range(60)))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    fast = ["--end", "20", "--noise", "stated"]
+    for command in (
+        ["smooth", tmp_path, *fast, "--solver", "ekf", "-o", tmp_path],
+        ["compare", tmp_path, *fast, "--solvers", "ekf,rts", "--against", other, "-o", tmp_path / "out"],
+        ["convert", truth, "-o", tmp_path, "--export", "csv"],
+    ):
+        assert "trajectory.csv" in refuse_command(capsys, "output.is_input", *command)
+        assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
 def test_ctrl_c_waits_for_what_must_not_be_cut():
     done = []
 
@@ -363,3 +386,17 @@ def test_a_call_of_run_takes_one_name_and_says_what_it_cannot_take():
         run("data/tokyo")  # type: ignore[arg-type]
     with refused("run.argument", ConfigError, "Settings", "dict"):
         run(recording, {"gnss": {"robust": "cauchy"}})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("values", "key", "names"),
+    [
+        ({"gnsss": {}}, "key.unknown", ("'gnsss'", "'gnss'")),
+        ({"gnss": {"robst": "cauchy"}}, "key.unknown", ("'gnss.robst'", "'robust'")),
+        ({"keyframes": {"rate": -1}}, "key.value", ("'keyframes.rate' = -1", "Hz")),
+    ],
+)
+def test_settings_made_in_python_are_refused_in_the_words_of_files(values, key, names):
+    with refused(key, ConfigError, "Settings", *names) as caught:
+        Settings(**values)
+    assert len(str(caught.value).splitlines()) == 1

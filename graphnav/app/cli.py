@@ -182,7 +182,7 @@ def detect(
         found = detected(used, settings)
         found = replace(found, notes=(*notes, *found.notes))
         tell("writing")
-        with stage_results(folder) as staged:
+        with stage_results(folder, used.files) as staged:
             files = detection_report.write_detections(used, found, staged)
     files = resolve_final_path(files, staged, folder)
     print_out(

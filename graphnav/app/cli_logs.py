@@ -60,7 +60,7 @@ def convert(
         conversion.check_rate(rate)
         alone = bool(out.suffix) and not out.is_dir()
         folder = check_output_folder(out.parent if alone else out)
-        with show_progress(quiet, "convert"), stage_results(folder) as part:
+        with show_progress(quiet, "convert"), stage_results(folder, [source]) as part:
             target = part / out.name if alone else part
             files, notes = conversion.export_file(source, target, export, point, rate, clock)
         files = resolve_final_path(files, part, folder)
@@ -138,7 +138,7 @@ def allan(
             taken = f" ({'; '.join(units)})" if units and error.key == "allan.moves" else ""
             raise RecordingError(f"{log}: {error}{taken}", key=error.key) from None
         tell("writing")
-        with stage_results(folder) as part:
+        with stage_results(folder, [log]) as part:
             written = pages.write_allan(result, part)
     written = resolve_final_path(written, part, folder)
     lines = [
@@ -165,7 +165,7 @@ def allan(
 
 @commands.command(epilog="\b\nExample:\n  graphnav init imu.csv ride.nmea -o recording.toml")
 def init(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="CSV files, known logs, or a folder of them.")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="CSV files, known logs, or a folder of them.")],
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The .toml to write, or its folder.")] = Path(
         "recording.toml"
     ),

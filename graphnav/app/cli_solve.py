@@ -234,11 +234,11 @@ def _solve_and_write(
         from graphnav.core.memory import keep_memory
 
     keep_memory()
-    allow_second_process()
     part = AskedPart(
         asked.recording, asked.start, asked.end, tuple(asked.topic or ()), asked.format, asked.allow_outside
     )
-    reading = begin_reading(part)  # which takes as long as all that is loaded and asked from here on
+    with allow_second_process():
+        reading = begin_reading(part)  # which takes as long as all that is loaded and asked from here on
     with pause_collector():
         from graphnav.app import convert, outputs, terminal, workflow
         from graphnav.app.summary import tabulate_comparison
@@ -280,16 +280,17 @@ def _solve_and_write(
         topics=tuple(asked.topic or ()), format=asked.format, allow_outside=asked.allow_outside, against=tuple(against),
         judge_arms=not alone, loose=loose,
     )  # fmt: skip
-    with show_progress(asked.quiet, *chosen) as progress:
+    with show_progress(asked.quiet, *chosen) as progress, allow_second_process():
         outcome = workflow.run_request(request, progress, reading)
         tell("writing")
-        with stage_results(folder) as staged:
+        inputs = (*outcome.recording.files, *(one.path for one in against))
+        with stage_results(folder, inputs) as staged:
             files = (outputs.write_run if alone else outputs.write_comparison_files)(outcome, staged, asked.pages)
         files = resolve_final_path(files, staged, folder)
         if not asked.pages:
             outputs.remove_pages(folder, () if alone else names)
         if exported:  # separately, so that a failing file does not prevent the others
-            with stage_results(folder) as staged:
+            with stage_results(folder, inputs) as staged:
                 more = convert.export_run(outcome, staged, exported, point, alone)
             files += resolve_final_path(more, staged, folder)
     verdicts = gates.judge_all(requirements, tabulate_comparison(outcome, ours=True)) if requirements else []

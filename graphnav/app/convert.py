@@ -86,19 +86,16 @@ def _add_measured_noise(log: Log) -> Log:
     imu = log.imu
     if imu is None or not imu.noise_assumed:
         return log
-    from graphnav.recording.draft.guesses import estimate_noise_density
+    from graphnav.recording.densities import measure_densities
 
-    found = {
-        f"{name}_noise_density": float(f"{value:.2g}")
-        for name, x in (("gyro", imu.gyro), ("accel", imu.accel))
-        if (value := estimate_noise_density(imu.t, x)) > 0.0
-    }
+    found = measure_densities(imu.t, imu.gyro, imu.accel, log.platform == "foot")
     if not found:
         return log
     figures = ", ".join(f"{key} = {value:g}" for key, value in found.items())
+    where = "in its quietest rest or stance" if log.platform == "foot" else "between its quietest and usual state"
     remark = Note(
         "imu.noise_measured",
-        f"noise: {figures} measured between its quietest and usual state; the other figures are of a consumer IMU",
+        f"noise: {figures} measured {where}; the other figures are of a consumer IMU",
     )
     noise = replace(imu.noise, **found)
     return replace(log, imu=replace(imu, noise=noise, noise_assumed=False), remarks=(*log.remarks, remark))

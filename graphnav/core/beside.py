@@ -2,7 +2,7 @@
 
 The process is a fork of this one, so that it has all data at no cost, and what it returns is pickled; but not what the
 work was given as arguments and returns as it is, which is here already. A library must not fork a program that it knows
-nothing of: only where `allow_second_process` was called, as by the command line, on Linux with a second processor, and
+nothing of: only within `allow_second_process`, as by the command line, on Linux with a second processor, and
 while this process is small. Elsewhere the same work is done in its turn.
 """
 
@@ -16,8 +16,8 @@ import signal
 import sys
 import warnings
 import weakref
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cached_property, partial
 from typing import Any, Generic, TypeVar
 
@@ -32,10 +32,15 @@ _PARENT_DEATH_SIGNAL = 1  # of prctl(2)
 _allowed = False
 
 
-def allow_second_process() -> None:
-    """Let work be done in a second process from now on."""
+@contextmanager
+def allow_second_process() -> Iterator[None]:
+    """Let work be done in a second process within this context."""
     global _allowed
-    _allowed = True
+    before, _allowed = _allowed, True
+    try:
+        yield
+    finally:
+        _allowed = before
 
 
 def may_begin() -> bool:

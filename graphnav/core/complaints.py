@@ -24,6 +24,7 @@ _LONG = re.compile(rf"\S{{{2 * _MAX_QUOTED},}}")  # a quoted value, as no senten
 _DEEPEST = 50  # levels of nested tables at most; graphnav's own files have four
 # keys of recording.toml that are put into a file of settings
 _OF_RECORDINGS = {"file", "axes", "columns", "units", "lever_arm", "sd", "sd_v", "time_offset", "noise", "platform"}
+_CURLY = "\u201c\u201d\u201e\u2018\u2019"  # quotes, as word processors write them
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
 
 
@@ -55,6 +56,8 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
         where, what = f"{path}", str(cause)
         if place := _TOML_PLACE.search(what):
             where, what = f"{path}, line {place[1]}, column {place[2]}", what[: place.start()]
+            if not set(_CURLY).isdisjoint(text.splitlines()[int(place[1]) - 1]):
+                what = f"quotes are curly: write {chr(34)}"
         what = _rephrase_toml(f"{what[:1].lower()}{what[1:]}")
         raise error(f"{where}: not valid TOML: {what}", key="toml.syntax") from None
 
@@ -104,10 +107,15 @@ def describe_invalid(source: str | Path, error: ValidationError, model: type[Bas
     """
     first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     loc = tuple(str(part) for part in first["loc"])
-    line = _find_line(text, loc)
-    where = f"{source}, line {line}: " if line else f"{source}: "
+    where = describe_place(source, text, loc)
     described = _describe_error(first, loc, model)
     return Note(described.key, where + _LONG.sub(lambda word: f"{word[0][:_MAX_QUOTED]}...", described))
+
+
+def describe_place(source: str | Path, text: str, loc: tuple[str, ...]) -> str:
+    """'file, line 12: ' of a key in a file's `text`, where it is found there."""
+    line = _find_line(text, loc)
+    return f"{source}, line {line}: " if line else f"{source}: "
 
 
 def _describe_error(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:

@@ -60,8 +60,8 @@ def resolve_beside(source: Path, name: str, key: str, allow_outside: bool) -> Pa
     path = source.parent / name
     if not is_inside(path, source.parent) and not allow_outside:
         raise RecordingError(
-            f"{source}: '{key}' names a file outside the folder that it lies in; move it there, or use --allow-outside "
-            "if you trust who wrote this",
+            f"{source}: '{key}' = '{_shorten(Path(name))}' lies outside its folder; move it there, or use "
+            "--allow-outside if you trust who wrote this",
             key="file.outside",
         )
     exists(path)

@@ -5,6 +5,8 @@ SciPy's filters do the same, and are quicker in long windows; importing them tak
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
@@ -41,6 +43,27 @@ def sum_running(terms: Array) -> Array:
         for k, term in enumerate(terms):
             np.add(out[k], term, out=out[k + 1])
     return out
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Running sums of rows: means over any window by one subtraction."""
+
+    total: Array  # (K + 1, c)
+    offset: Array  # (c,) subtracted before summing, so that sums over many hours keep their precision
+
+    def compute_means(self, length: int, step: int = 1) -> Array:
+        """(W, c) means over windows of `length` rows that begin every `step` rows."""
+        last = self.total[length::step]
+        return np.asarray((last - self.total[: -length or None : step][: len(last)]) / length + self.offset)
+
+
+def sum_rows(rows: Array) -> Sums:
+    """Running sums down the rows, (K, c)."""
+    offset = rows.mean(axis=0) if len(rows) else np.zeros(rows.shape[1])
+    total = np.zeros((len(rows) + 1, rows.shape[1]))
+    np.cumsum(rows - offset, axis=0, out=total[1:])
+    return Sums(total, offset)
 
 
 def _view_windows(x: Array, size: int) -> Array:

@@ -7,7 +7,7 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -15,17 +15,17 @@ from graphnav.core.errors import ConfigError, PartlyWrittenError
 
 
 @contextmanager
-def stage_results(folder: Path) -> Iterator[Path]:
+def stage_results(folder: Path, read: Iterable[str | Path] = ()) -> Iterator[Path]:
     """A folder to write into; its files move to `folder` at the end, or are removed if the end is not reached.
 
     It lies inside `folder`, so that moving is renaming; `folder` is created if need be, and removed again if it stays
     empty. A file of the same name is replaced in one step. After a `PartlyWrittenError` the files written so far are
-    kept, and no older file remains in place of one that is missing.
+    kept, and no older file remains in place of one that is missing. No file that was `read` is replaced.
 
     Raises
     ------
     ConfigError
-        If it cannot be written, as when the disk is full.
+        If it cannot be written, as when the disk is full, or would be in place of one that was read.
     """
     made = _list_missing(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -37,9 +37,16 @@ def stage_results(folder: Path) -> Iterator[Path]:
                 yield part
             except PartlyWrittenError as error:
                 failed = error
+            every = {file: folder / file.relative_to(part) for file in sorted(part.rglob("*")) if file.is_file()}
+            inputs = {Path(one).resolve() for one in read}
+            for target in every.values():
+                if target.resolve() in inputs:
+                    raise ConfigError(
+                        f"-o {folder}: {target} was read, and would be replaced; name another folder",
+                        key="output.is_input",
+                    )
             with defer_interrupts():
-                for file in sorted(path for path in part.rglob("*") if path.is_file()):
-                    target = folder / file.relative_to(part)
+                for file, target in every.items():
                     target.parent.mkdir(parents=True, exist_ok=True)
                     os.replace(file, target)
                 for file in () if failed is None else failed.missing:

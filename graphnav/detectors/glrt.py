@@ -20,10 +20,11 @@ import numpy as np
 
 from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
+from graphnav.core.running import sum_rows
 from graphnav.detectors.base import NONE, Detection, find_spans, mask_within
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import choose_threshold, find_fewest_errors
-from graphnav.detectors.windows import WINDOW_STEP, WindowMeans, sum_rows
+from graphnav.detectors.windows import WINDOW_STEP, WindowMeans
 
 _TINY = 1e-300
 _GRAVITY_ERROR = 0.05  # share of g that an accelerometer's scale and bias may be off

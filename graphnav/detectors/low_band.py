@@ -20,10 +20,11 @@ import numpy as np
 from graphnav.config.detectors import LowBandSettings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
+from graphnav.core.running import sum_rows
 from graphnav.detectors.base import NONE, Detection, drop_short, find_spans, mask_within
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import MISLABELLED, MISTAKEN, SHORTEST_POPULATION, find_valley, log_statistic
-from graphnav.detectors.windows import LowPassed, compute_window_times, find_unbroken, sum_rows
+from graphnav.detectors.windows import LowPassed, compute_window_times, find_unbroken
 from graphnav.recording import ImuNoise
 
 NAME = "low_band_glrt"

@@ -32,9 +32,10 @@ from graphnav.config.detectors import FUSED, StanceSettings
 from graphnav.core import rotation
 from graphnav.core.notes import Note, Notes, format_count
 from graphnav.core.rotation import Array
+from graphnav.core.running import sum_rows
 from graphnav.detectors.base import NONE, Detection, Detections, drop_short, find_spans, mask_inside, merge_spans, unite
 from graphnav.detectors.glrt import compute_glrt
-from graphnav.detectors.windows import find_unbroken, sum_rows
+from graphnav.detectors.windows import find_unbroken
 from graphnav.recording import Imu
 
 _QUIET_SPAN = 1.0  # s; the quietest second of the recording defines bias and gravity

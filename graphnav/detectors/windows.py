@@ -13,6 +13,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from graphnav.core.rotation import Array
+from graphnav.core.running import sum_rows
 from graphnav.recording import Imu
 
 BLOCK_RATE = 50.0  # Hz, lowest rate of the blocks
@@ -61,27 +62,6 @@ def average_blocks(imu: Imu, row_period: float) -> BlockMeans:
     start = np.r_[imu.t[0] - row_period, end[:-1]]
     whole = end - start < size * row_period + max(_LONGEST_BLOCK_GAP, row_period)
     return BlockMeans(end - 0.5 * size * row_period, end, mean, size * row_period, row_period, whole)
-
-
-@dataclass(frozen=True)
-class Sums:
-    """Running sums of rows: means over any window by one subtraction."""
-
-    total: Array  # (K + 1, c)
-    offset: Array  # (c,) subtracted before summing, so that sums over many hours keep their precision
-
-    def compute_means(self, length: int, step: int = 1) -> Array:
-        """(W, c) means over windows of `length` rows that begin every `step` rows."""
-        last = self.total[length::step]
-        return np.asarray((last - self.total[: -length or None : step][: len(last)]) / length + self.offset)
-
-
-def sum_rows(rows: Array) -> Sums:
-    """Running sums down the rows, (K, c)."""
-    offset = rows.mean(axis=0) if len(rows) else np.zeros(rows.shape[1])
-    total = np.zeros((len(rows) + 1, rows.shape[1]))
-    np.cumsum(rows - offset, axis=0, out=total[1:])
-    return Sums(total, offset)
 
 
 def compute_window_times(t: Array, length: int, step: int = 1) -> Array:

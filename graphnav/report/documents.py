@@ -220,7 +220,7 @@ def write_comparison(
     lead = [
         *_list_reasons(defects, solutions, every),
         page.paragraph(words.describe_run(recording, solutions, withheld, outages)),
-        *_describe_verdicts(solutions, every),
+        page.judged(_describe_verdicts(solutions, every)),
         *(note for name, values in metrics_of.items() for note in words.describe_closure(name, values)),
         words.list_tiles(recording, solutions, every),
         *summary.list_links(beside),

@@ -115,7 +115,7 @@ def _describe_sliding(solution: Solution) -> Note | None:
     if size <= TOO_LARGE[record.kind]:
         return None
     words = f"in its steps nothing stands still as a shoe on the floor does (speeds of {size:.2g} sigma in the median)"
-    return Note("doubt.stances", f"This result cannot be trusted: {words}: is the IMU on a foot?")
+    return Note("doubt.stances", f"This result cannot be trusted: {words}: is the IMU on a foot, and never clipped?")
 
 
 def _describe_vague(solution: Solution) -> Note | None:

@@ -33,9 +33,9 @@ _TEMPLATES = Environment(
     loader=FileSystemLoader(_HERE), autoescape=True, finalize=format_value, undefined=StrictUndefined, trim_blocks=True
 )
 _PARTS: Any = _TEMPLATES.get_template("parts.html").module
-bullets, code, columns, digest, download, fold, gallery, heading, links, pairs, paragraph, tiles, verdicts = (
+bullets, code, columns, digest, download, fold, gallery, heading, judged, links, pairs, paragraph, tiles, verdicts = (
     getattr(_PARTS, name) for name in (
-        "bullets", "code", "columns", "digest", "download", "fold", "gallery", "heading", "links", "pairs",
+        "bullets", "code", "columns", "digest", "download", "fold", "gallery", "heading", "judged", "links", "pairs",
         "paragraph", "tiles", "verdicts",
     )
 )  # fmt: skip

@@ -13,7 +13,10 @@ from graphnav.core.complaints import suggest_nearest
 _SMALLEST, _LARGEST = 1e-15, 1e9  # of a number, so that its square can be represented
 _MAX_COMPONENT = 1e7  # of the components of a vector: m from the Earth's centre, or a direction
 
+LATEST = 1e11  # s, either sign: three thousand years
+
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+Offset = Annotated[Number, Field(ge=-LATEST, le=LATEST)]
 
 
 def check_magnitude(value: float) -> float:
@@ -75,7 +78,7 @@ class SensorTable(TomlTable):
 
     file: str = Field(min_length=1)
     columns: dict[str, str] = Field({}, description="our name = the file's")
-    time_offset: Number = Field(0.0, description="s, added to the file's stamps")
+    time_offset: Offset = Field(0.0, description="s, added to the file's stamps")
     keep: Keep | None = None
     topic: Topics = Field((), description="of a ROS bag, or several: a fix's and a velocity's")
 

@@ -18,6 +18,8 @@ from graphnav.simulation.scenarios import Scenario, list_scenarios
 
 __all__ = ["Scenario", "Simulated", "describe_scenarios", "get_scenario", "list_scenarios", "parse_options", "simulate"]
 
+_LONGEST = 86400.0  # s
+
 
 def get_scenario(name: str) -> Scenario:
     """The scenario of that name.
@@ -67,6 +69,10 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
                 f"scenario '{name}': {key} = {value!r} is not of the kind of its default {known[key]!r}",
                 key="simulation.value",
             )
+    if not options.get("duration", 0.0) <= _LONGEST:
+        raise ConfigError(
+            f"duration = {options['duration']:g}: must be at most {_LONGEST:g} s, a day", key="simulation.value"
+        )
     if not 0 <= seed < 2**32:
         raise ConfigError(f"seed {seed}: must be from 0 to {2**32 - 1}", key="simulation.value")
     return one.run(seed, **options)

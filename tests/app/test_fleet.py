@@ -21,7 +21,7 @@ from helpers import refused
 from graphnav import load
 from graphnav.app import cli
 from graphnav.app.fleet import page, tables
-from graphnav.app.fleet.drive import CRASHED, DONE, HUNG, REFUSED, choose_spans, hash_task, read_row
+from graphnav.app.fleet.drive import CRASHED, DONE, HUNG, REFUSED, choose_spans, hash_task, read_row, solve_drive
 from graphnav.app.fleet.manifest import DriveOptions, Task, build_task, read_drives
 from graphnav.app.fleet.workers import Limits, Worker, solve_on_cluster
 from graphnav.config import Settings
@@ -209,7 +209,7 @@ def test_a_manifest_gives_each_drive_its_own_settings(tmp_path: Path) -> None:
         drives = read_drives(tmp_path / name, DriveOptions(solver="rts"))
         tasks = [build_task(drive, tmp_path, {}) for drive in drives]
         assert [task.name for task in tasks] == ["kitti", "kitti-2"]
-        found.append(tasks)
+        found.append([replace(task, place="") for task in tasks])
     assert found[0] == found[1]
     own, usual = (Settings.model_validate(task.settings) for task in found[0])
     assert (own.keyframes.rate, own.standstill.zero_rate, own.noise.mode) == (4.0, False, "stated")
@@ -229,7 +229,7 @@ def test_a_manifest_of_a_spreadsheet_may_have_semicolons(tmp_path: Path) -> None
         ("recording,profil\nkitti,car\n", ("line 1", "profile")),
         ("name\na\n", ("line 1", "recording")),
         ("recording,start\nkitti,soon\n", ("line 2", "start", "soon")),
-        ("recording,name\nkitti,a\nkitti,a\n", ("'a'",)),
+        ("recording,name\nkitti,a\nkitti,a\n", ("line 3", "'a'")),
         ("recording,solver\nkitti,rst\n", ("line 2", "rts")),
         ("recording,settings\nkitti,keyframes.rat = 2\n", ("line 2", "rate")),
         ("recording,settings\nkitti,keyframes rate\n", ("line 2", "settings")),
@@ -248,6 +248,23 @@ def test_a_manifest_that_cannot_be_is_refused_where_it_says_so(tmp_path: Path, t
     assert "m.csv" in str(caught.value)
     for word in words:
         assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line"),
+    [
+        ("m.csv", "recording,name\nkitti,a\n\nlost,b\n", 4),
+        ("m.toml", '[[drive]]\nrecording = "kitti"\n\n[[drive]]\nrecording = "lost"\n', 4),
+    ],
+)
+def test_a_recording_that_is_not_there_is_refused_where_a_manifest_names_it(
+    tmp_path: Path, name: str, text: str, line: int
+) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    row = solve_drive(build_task(read_drives(path, DriveOptions())[1], tmp_path / "out", {}))
+    assert row["status"] == REFUSED
+    assert f"{path}, line {line}: {tmp_path / 'lost'}" in row["error"]
 
 
 def test_a_manifest_is_not_blamed_for_what_the_command_line_says(

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from graphnav import load, run
+from graphnav.app import cli
 from graphnav.core import beside
 from graphnav.core.beside import Beside, Later, allow_second_process, begin_beside
 from graphnav.core.errors import PartlyWrittenError, RecordingError
@@ -23,7 +24,6 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="a second proces
 
 @pytest.fixture(autouse=True)
 def two_processors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(beside, "_allowed", False)
     monkeypatch.setattr(beside, "read_peak_memory_mb", lambda: 100.0)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     yield
@@ -31,23 +31,38 @@ def two_processors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         os.waitpid(-1, os.WNOHANG)
 
 
+@pytest.fixture
+def allowed() -> Iterator[None]:
+    with allow_second_process():
+        yield
+
+
 def test_it_is_done_here_unless_allowed() -> None:
+    assert begin_beside(os.getpid).get_result() == os.getpid()
+    with allow_second_process():
+        assert begin_beside(os.getpid).get_result() != os.getpid()
     assert begin_beside(os.getpid).get_result() == os.getpid()
 
 
+def test_a_command_allows_it_for_itself_alone(tmp_path: Path) -> None:
+    tokyo = str(Path(__file__).parents[2] / "data" / "tokyo")
+    options = ["--end", "20", "--solver", "ekf", "--noise", "stated", "--quiet"]
+    assert cli.run(["smooth", tokyo, *options, "-o", str(tmp_path)]) == 0
+    assert not beside.may_begin()
+
+
 @pytest.mark.parametrize(("processors", "mb"), [({0}, 100.0), ({0, 1}, 5000.0)])
+@pytest.mark.usefixtures("allowed")
 def test_it_is_done_here_without_a_processor_or_memory(
     processors: set[int], mb: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    allow_second_process()
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: processors)
     monkeypatch.setattr(beside, "read_peak_memory_mb", lambda: mb)
     assert isinstance(begin_beside(os.getpid), Later)
 
 
+@pytest.mark.usefixtures("allowed")
 def test_it_is_done_here_where_the_system_has_no_more_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    allow_second_process()
-
     def fail() -> int:
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
@@ -55,8 +70,8 @@ def test_it_is_done_here_where_the_system_has_no_more_processes(monkeypatch: pyt
     assert begin_beside(os.getpid).get_result() == os.getpid()
 
 
+@pytest.mark.usefixtures("allowed")
 def test_large_results_come_back() -> None:
-    allow_second_process()
     numbers = np.random.default_rng(1).standard_normal(500_000)
     work = begin_beside(lambda: (os.getpid(), 2.0 * numbers))
     process, found = work.get_result()
@@ -64,9 +79,8 @@ def test_large_results_come_back() -> None:
     np.testing.assert_array_equal(found, 2.0 * numbers)
 
 
+@pytest.mark.usefixtures("allowed")
 def test_an_error_is_raised_where_the_result_is_wanted() -> None:
-    allow_second_process()
-
     def refuse() -> None:
         raise RecordingError("no GNSS", key="gnss.none")
 
@@ -78,8 +92,8 @@ def test_an_error_is_raised_where_the_result_is_wanted() -> None:
         work.get_result()
 
 
+@pytest.mark.usefixtures("allowed")
 def test_what_is_not_to_be_sent_is_done_here() -> None:
-    allow_second_process()
     assert begin_beside(lambda: lambda: 2.0).get_result()() == 2.0
     missing = (Path("a"),)
 
@@ -91,8 +105,8 @@ def test_what_is_not_to_be_sent_is_done_here() -> None:
     assert caught.value.missing == missing
 
 
+@pytest.mark.usefixtures("allowed")
 def test_where_the_process_is_killed_the_work_is_done_here() -> None:
-    allow_second_process()
     own = os.getpid()
 
     def work() -> int:
@@ -103,15 +117,15 @@ def test_where_the_process_is_killed_the_work_is_done_here() -> None:
     assert begin_beside(work).get_result() == own
 
 
+@pytest.mark.usefixtures("allowed")
 def test_it_ends_with_what_it_was_begun_for() -> None:
-    allow_second_process()
     work = begin_beside(lambda: time.sleep(1000.0))
     assert isinstance(work, Beside)
     del work  # the fixture sees that nothing is left
 
 
+@pytest.mark.usefixtures("allowed")
 def test_what_the_work_was_given_is_not_sent_back() -> None:
-    allow_second_process()
     numbers, names = np.arange(10.0), {"inner": [np.ones(3)]}
 
     def give_back(numbers: np.ndarray, names: dict[str, list[np.ndarray]]) -> tuple[object, ...]:
@@ -123,8 +137,8 @@ def test_what_the_work_was_given_is_not_sent_back() -> None:
     np.testing.assert_array_equal(found[3], numbers[:5])
 
 
+@pytest.mark.usefixtures("allowed")
 def test_what_was_ended_is_done_here_if_it_is_wanted_after_all() -> None:
-    allow_second_process()
     work = begin_beside(os.getpid)
     work.end()
     assert work.get_result() == os.getpid()
@@ -138,8 +152,8 @@ def test_a_run_is_the_same_with_a_second_process(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(Beside, "get_result", lambda one: begun.append(one) or work(one))
     alone = run(drive, solvers=("ekf", "rts"))
     assert not begun
-    allow_second_process()
-    both = run(drive, solvers=("ekf", "rts"))
+    with allow_second_process():
+        both = run(drive, solvers=("ekf", "rts"))
     assert begun
     for name, one in alone.items():
         for field in ("R_nb", "p", "v", "ba", "bg"):

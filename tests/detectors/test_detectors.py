@@ -18,6 +18,7 @@ from graphnav.app import cli
 from graphnav.config import Settings
 from graphnav.config.detectors import FftSettings, FusionSettings
 from graphnav.core.notes import get_key
+from graphnav.core.running import sum_rows
 from graphnav.detectors import base, detect, fft, find_stops, glrt, motion, spectrum, thresholds, windows
 from graphnav.recording import Imu, ImuNoise, Odometer, Recording
 from graphnav.recording.formats import read
@@ -67,7 +68,7 @@ def test_statistics_are_the_sums_of_skog():
 def test_running_sums_keep_their_digits_over_hours():
     rng = np.random.default_rng(2)
     rows = 96.0 + 1e-3 * rng.standard_normal((2_000_000, 1))
-    means = windows.sum_rows(rows).compute_means(50)
+    means = sum_rows(rows).compute_means(50)
     assert np.abs(means[-1] - rows[-50:].mean()) < 1e-9
     assert len(means) == len(rows) - 49
 

@@ -23,7 +23,7 @@ from graphnav.detectors import detect
 from graphnav.estimation import joint_estimate
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.alignment.first import pick_fixes
-from graphnav.estimation.alignment.motion import drop_implausible
+from graphnav.estimation.alignment.motion import drop_implausible, find_motion_span
 from graphnav.estimation.faults.verdicts import Verdicts
 from graphnav.estimation.noise.words import describe_turned_axes
 from graphnav.estimation.pipeline import choose_origin, run
@@ -217,3 +217,18 @@ def test_the_first_and_the_last_fix_can_be_outliers(end: int) -> None:
     assert fewer is not None
     assert some.t[end] == gnss.t[end]
     assert fewer.t[end] != gnss.t[end]
+
+
+@pytest.mark.parametrize("vague", [slice(0, 4), slice(0, None, 9)])
+def test_vague_fixes_do_not_hide_the_motion(vague: slice) -> None:
+    """The first ones of a receiver, or a mark for no fix among the others."""
+    drive = load(HERE / "data" / "tokyo").crop(0.0, 40.0)
+    gnss = drive.gnss
+    assert gnss is not None
+    sd = gnss.sd.copy()
+    sd[vague] = 9999.0
+    span = find_motion_span(drop_implausible(drive), Settings())
+    found = find_motion_span(drop_implausible(replace(drive, gnss=replace(gnss, sd=sd))), Settings())
+    assert span is not None
+    assert found is not None
+    assert abs(found[0] - span[0]) < 1.0

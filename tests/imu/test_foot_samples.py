@@ -15,13 +15,14 @@ from graphnav.core import rotation as ro
 from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.estimation.noise.imu_floor import apply_measured_floor, bound_density
+from graphnav.estimation.noise.imu_floor import apply_measured_floor
 from graphnav.imu.clipping import find_cut_peaks, restore_peaks
 from graphnav.imu.onboard_offset import compare_offsets, estimate_learnt_offset, remove_onboard_offset
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.imu.unresolved import add_coning, add_unresolved_motion
 from graphnav.recording import Imu, ImuNoise
+from graphnav.recording.densities import bound_density
 from graphnav.recording.formats import read
 from graphnav.simulation import Simulated, simulate
 

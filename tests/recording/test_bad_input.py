@@ -148,6 +148,15 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
         content("imu.csv", b"t;gx;gy;gz;ax;ay;az\n1;2;3;4;5;6;7\n"),
         ("table.separator", "line 1"),
     ),
+    "web page": (
+        content("gnss.csv", b"<!DOCTYPE html>\n<html><body>404, gone</body>\n"),
+        ("file.no_table", "gnss.csv"),
+    ),
+    "pointer of LFS": (
+        content("gnss.csv", b"version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 12\n"),
+        ("file.no_table", "gnss.csv", "git lfs pull"),
+    ),
+    "JSON": (content("gnss.csv", b'{"t": [1, 2], "lat": [3, 4]}\n'), ("file.no_table", "gnss.csv")),
     "gz that is none": (zipped(b"t,gx\n1,2\n"), ("file.gzip", "imu.csv.gz")),
     "gz cut off": (zipped(gzip.compress(b"t,gx,gy,gz,ax,ay,az\n" * 50)[:30]), ("file.damaged", "imu.csv.gz")),
     "gz without the name": (content("imu.csv", gzip.compress(b"t,gx\n")), ("file.gzip", "imu.csv")),
@@ -182,7 +191,14 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
     ),
     "NaN everywhere": (every("imu.csv", lambda row: [row[0], *[float("nan")] * 6]), ("table.all_blank", "imu.csv")),
     "one row": (content("imu.csv", f"{IMU_HEADER}\n{GOOD_ROW}\n".encode()), ("table.few_rows", "imu.csv")),
-    "one time": (every("imu.csv", lambda row: [3.0, *row[1:]]), ("table.few_rows", "imu.csv")),
+    "one time": (every("imu.csv", lambda row: [3.0, *row[1:]]), ("table.times_repeated", "imu.csv", "'t'")),
+    "fixes at one time": (every("gnss.csv", lambda row: [3.0, *row[1:]]), ("table.times_repeated", "gnss.csv", "'t'")),
+    "a minus as in print": (line("imu.csv", 7, "0.06,0,0,0,0,\u22120.1,9.8"), ("table.cell", "line 7", "'ay'", "init")),
+    "a thousand": (line("imu.csv", 7, "0.06,0,0,0,0,1'000.5,9.8"), ("table.cell", "line 7", "'ay'", "init")),
+    "a zone": (
+        line("imu.csv", 7, "2025-07-08 16:00:00 JST,0,0,0,0,0,9.8"),
+        ("table.cell", "line 7", "'t'", "JST", "+09:00"),
+    ),
     "time in ms": (every("imu.csv", shift_decimal(0, 1e3)), ("imu.time_unit", "imu.csv", 't = "ms"')),
     "time in us": (every("imu.csv", shift_decimal(0, 1e6)), ("imu.time_unit", "imu.csv", 't = "us"')),
     # positions
@@ -250,9 +266,12 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
         toml('axes = "RFU"', 'units = { gyros = "rad/s" }'),
         ("key.unknown", "'imu.units.gyros'", "'gyro'"),
     ),
+    "offset of an age": (toml('axes = "RFU"', "time_offset = 1e18"), ("key.value", "line 7", "'imu.time_offset'")),
+    "curly quotes": (toml('"RFU"', "\u201cRFU\u201d"), ("toml.syntax", "line 7", "quotes")),
+    "file elsewhere": (toml('"gnss.csv"', '"/etc/gnss.csv"'), ("file.outside", "'gnss.file' = '/etc/gnss.csv'")),
     "infinite offset": (toml('axes = "RFU"', "time_offset = inf"), ("key.value", "'imu.time_offset'")),
     # mounting
-    "left-handed axes": (toml("RFU", "FRU"), ("key.value", "'imu.axes' = 'FRU'", "FRD")),
+    "left-handed axes": (toml("RFU", "FRU"), ("key.value", "line 7", "'imu.axes' = 'FRU'", "FRD")),
     "axes garbage": (toml("RFU", "XYZ"), ("key.value", "'imu.axes' = 'XYZ'")),
     "axes repeat": (toml("RFU", "RLU"), ("key.value", "'imu.axes' = 'RLU'")),
     "axes too short": (toml("RFU", "RF"), ("key.value", "'imu.axes' = 'RF'")),
@@ -360,6 +379,17 @@ def test_what_can_be_mended_safely_is_and_is_remarked_on(tmp_path: Path, case: s
     assert_told(recording.remarks, *remark)
     assert len(recording.imu.t) == rows
     assert (np.diff(recording.imu.t) > 0).all()
+
+
+def test_commas_in_quotes_and_marks_at_the_start_are_no_cells(tmp_path: Path) -> None:
+    whole = read(write_small(tmp_path))
+    header, *rows = (tmp_path / "imu.csv").read_text().splitlines()
+    text = "\n".join([f'{header},"what, else"', *(f'{row},"a, b"' for row in rows)]) + "\n"
+    (tmp_path / "imu.csv").write_bytes(b"\xef\xbb\xbf" * 2 + text.encode())
+    quoted = read(tmp_path)
+    assert quoted.remarks == ()
+    assert np.array_equal(quoted.imu.gyro, whole.imu.gyro)
+    assert np.array_equal(quoted.imu.t, whole.imu.t)
 
 
 def test_sorting_keeps_rows_together_and_repeats_keep_the_first(tmp_path: Path) -> None:

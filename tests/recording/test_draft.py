@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import tomllib
 from pathlib import Path
@@ -16,10 +17,13 @@ from graphnav.app import cli
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import exp
 from graphnav.recording.checks.overview import inspect
+from graphnav.recording.densities import estimate_density_in_motion, measure_densities
 from graphnav.recording.draft import draft, guesses, motion
 from graphnav.recording.draft.agreement import find_level_axes
+from graphnav.recording.draft.logs import read_log
 from graphnav.recording.formats import columns, read
 from graphnav.recording.formats.axes import parse_axes_letters
+from graphnav.simulation import simulate
 
 DRIVE, _ = oracle.drive(
     oracle.vehicle_path(240.0, 50.0), seed=3, gnss_rate=5.0, gnss_velocity_sd=(0.05, 0.05, 0.1), odometer_rate=20.0
@@ -135,7 +139,31 @@ def test_rates_in_no_unit_are_refused_only_as_counts():
 def test_white_noise_is_measured():
     rng = np.random.default_rng(2)
     t = np.arange(60000) / 100
-    assert guesses.estimate_noise_density(t, rng.normal(0, 0.02, (60000, 3))) == pytest.approx(0.002, rel=0.25)
+    assert estimate_density_in_motion(t, rng.normal(0, 0.02, (60000, 3))) == pytest.approx(0.002, rel=0.25)
+
+
+@pytest.mark.parametrize("rest", [0.0, 5.0])
+def test_noise_of_a_walk_is_that_of_its_sensors_not_of_its_steps(rest):
+    """Stances of half a second show it where nothing else does."""
+    t = 0.005 * np.arange(1, 8001)
+    swing = (t > rest) & (t % 1.1 > 0.5)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        steps = swing[:, None] * rng.normal(0.0, 3.0, (len(t), 3))
+        gyro, accel = (s / np.sqrt(0.005) * rng.standard_normal((len(t), 3)) + steps for s in (5e-4, 2e-3))
+        found = measure_densities(t, gyro, accel, walks=True)
+        assert 0.9 < found["gyro_noise_density"] / 5e-4 < 2.0
+        assert 0.9 < found["accel_noise_density"] / 2e-3 < 2.0
+    assert measure_densities(t[:40], gyro[:40], accel[:40], walks=True) == {}  # too short
+
+
+def test_a_walk_is_drafted_with_the_noise_of_its_sensors(tmp_path):
+    made = simulate("gait", 1, duration=20.0)
+    made.write(tmp_path / "walk")
+    noise = tomllib.loads(draft([tmp_path / "walk" / "imu.csv.gz"], tmp_path).text)["imu"]["noise"]
+    true = made.recording.imu.noise
+    assert 1.0 < noise["gyro_noise_density"] / true.gyro_noise_density < 3.0
+    assert 1.0 < noise["accel_noise_density"] / true.accel_noise_density < 3.0
 
 
 # ---- motion
@@ -210,6 +238,44 @@ def test_forces_that_point_down_leave_the_axes_to_be_found_but_for_their_sign(tm
     found, recording = drafted(tmp_path, write_logs(tmp_path, "RFU", accel=-1.0))
     assert 'axes = "RBD"' in found.text
     assert [f.key for f in inspect(recording).findings if f.severity == "refused"] == ["gnss.mirrored"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: ["time [s],latitude [deg],longitude [deg],height [m]", *rows[1:]], None),
+        (lambda rows: ["time_s,latitude_deg,longitude_deg,height_m", "[s],[deg],[deg],[m]", *rows[1:]], "units"),
+        (lambda rows: [rows[0], *(row.replace("-", "\u2212") for row in rows[1:])], "minus"),
+        (lambda rows: [rows[0], *(re.sub(r",(\d)(\d{3})\.", r",\1'\2.", row) for row in rows[1:])], "thousands"),
+    ],
+)
+def test_numbers_and_units_in_other_spellings_are_the_same_fixes(change, words, tmp_path):
+    rows = [f"{t:.1f},{-35.5 + 1e-6 * t:.9f},{-2.25 - 2e-6 * t:.9f},{1200 + 0.01 * t:.2f}" for t in range(300)]
+    plain = ["time,latitude,longitude,height", *rows]
+    found = []
+    for name, lines in (("a.csv", plain), ("b.csv", change(plain))):
+        (tmp_path / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        found.append(read_log(tmp_path / name)["gnss"])
+    assert {x: v.tolist() for x, v in found[0].values.items()} == {x: v.tolist() for x, v in found[1].values.items()}
+    assert (found[1].plain is not None and words in found[1].plain.words) if words else found[1].plain is None
+
+
+def test_dates_in_utc_by_name(tmp_path):
+    rows = [f"2025-07-08 16:00:{t:02d} UTC,35.5,139.7,40.0" for t in range(60)]
+    (tmp_path / "a.csv").write_text("\n".join(["time,lat,lon,h", *rows]) + "\n")
+    source = read_log(tmp_path / "a.csv")["gnss"]
+    assert source.t[0] == 1751990400.0
+    assert "CHECK" not in source.plain.words
+
+
+@pytest.mark.parametrize("data", [b"", bytes(range(256)) * 20, b"<!DOCTYPE html>\n<html>404, gone\n"])
+def test_a_named_file_that_cannot_be_read_is_not_left_out(data, tmp_path):
+    """Though the other logs make a drive."""
+    imu, gnss, wheel = write_logs(tmp_path)
+    gnss.write_bytes(data)
+    with pytest.raises(RecordingError) as caught:
+        draft([imu, gnss, wheel], tmp_path)
+    assert str(caught.value).startswith(f"{gnss}: ")
 
 
 def test_a_named_file_that_is_no_table_is_not_left_out_of_a_drive(tmp_path):

@@ -235,6 +235,16 @@ def test_a_dead_axis_on_a_foot_is_refused(shared_data: Path) -> None:
     assert found(late.crop(0.0, 0.45 * walk.duration)) == {}  # which the sentence proposes
 
 
+@pytest.mark.parametrize("sensor", ["accel", "gyro"])
+def test_a_dead_sensor_is_refused(tokyo: Recording, sensor: str) -> None:
+    def still(x: np.ndarray) -> np.ndarray:
+        return np.tile([0.0, 0.0, 9.8] if sensor == "accel" else np.zeros(3), (len(x), 1))
+
+    assert found(change(tokyo, "imu", **{sensor: still}))["imu.dead_axis"] == "refused"
+    stands = replace(tokyo.crop(26.0, 48.0), odometer=None, gnss=None)  # where a coarse one may read nothing
+    assert "imu.dead_axis" not in found(change(stands, "imu", **{sensor: still}))
+
+
 def test_an_axis_that_rests_with_the_others_is_not_dead(tokyo: Recording) -> None:
     coarse = change(tokyo, "imu", gyro=lambda x: np.round(x / 0.02) * 0.02)  # it then stands still for half a minute
     still = np.diff(coarse.imu.gyro[:, 0]) == 0.0
@@ -325,6 +335,19 @@ def test_reach_grows_with_the_time_between_fixes() -> None:
     assert not find_out_of_reach(t, p).any()
     p[2, 1] = 3000.0  # within a second
     assert np.flatnonzero(find_out_of_reach(t, p)).tolist() == [2]
+
+
+@pytest.mark.parametrize("sigma", [100.0, 200.0, 300.0])
+def test_noise_is_no_fix_out_of_reach(sigma: float) -> None:
+    """However far it scatters; and what lies beyond it still is."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        t = 0.2 * np.arange(660)
+        p = np.outer(t, [10.0, 5.0, 0.0]) + rng.normal(0.0, sigma, (660, 3))
+        assert not find_out_of_reach(t, p).any()
+        wrong = rng.choice(np.arange(5, 655), 60, replace=False)
+        p[wrong] += 1e5
+        assert np.array_equal(np.flatnonzero(find_out_of_reach(t, p)), np.sort(wrong))
 
 
 def test_fixes_of_two_places_are_not_trusted(tokyo: Recording) -> None:
@@ -422,6 +445,34 @@ def test_sigmas_that_are_all_zero_or_below_it_are_refused(tmp_path: Path, sd: tu
         choose_sigmas(
             table(tmp_path, *sd), ("sd_e", "sd_n", "sd_u"), None, (1.0, 1.0, 1.0), "GNSS position", every, Notes()
         )
+
+
+@pytest.mark.parametrize("value", [0.0, 7.0])
+def test_velocities_that_were_not_logged_are_not_used(tokyo: Recording, value: float) -> None:
+    same = change(tokyo, "gnss", v=lambda v: np.full_like(v, value))
+    assert found(same)["gnss.velocity_constant"] == "warning"
+    assert screen(same).recording.gnss.v is None
+    stands = change(tokyo.crop(26.0, 48.0), "gnss", v=np.zeros_like)
+    assert "gnss.velocity_constant" not in found(stands)
+
+
+@pytest.mark.parametrize("value", [0.0, 5.0])
+def test_an_odometer_that_never_changes_is_not_used(tokyo: Recording, value: float) -> None:
+    same = change(tokyo, "odometer", speed=lambda x: np.full_like(x, value))
+    assert found(same)["odometer.constant"] == "warning"
+    assert screen(same).recording.odometer is None
+    assert "odometer.constant" not in found(change(tokyo.crop(30.0, 48.0), "odometer", speed=np.zeros_like))
+
+
+def test_a_place_that_is_held_is_no_group(tokyo: Recording) -> None:
+    """Ten seconds of one place while the car drives, and then the stop."""
+    drive = tokyo.crop(0.0, 60.0)
+
+    def hold(llh: np.ndarray) -> np.ndarray:
+        llh[50:100] = llh[50]
+        return llh
+
+    assert "gnss.two_groups" not in found(change(drive, "gnss", llh=hold))
 
 
 @pytest.mark.parametrize("which", ["mixed", "block"])

@@ -23,8 +23,8 @@ from graphnav.app.talk import NOT_MET
 from graphnav.core.notes import get_key
 from graphnav.core.timescales import compute_clock_offset
 from graphnav.recording.checks.overview import inspect
+from graphnav.recording.densities import estimate_density_in_motion
 from graphnav.recording.draft import draft
-from graphnav.recording.draft.guesses import estimate_noise_density
 from graphnav.recording.draft.plain import read_plain
 from graphnav.recording.formats import read
 from graphnav.recording.formats.trajectories import read_trajectory
@@ -451,7 +451,7 @@ def test_a_bag_with_two_imus(tokyo, tmp_path, capsys):
     run("convert", bag, "-o", tmp_path / "converted", "--topic", "/imu/data", "--quiet")
     noise = read(tmp_path / "converted").imu.noise
     for stated, x in ((noise.gyro_noise_density, by_flag.imu.gyro), (noise.accel_noise_density, by_flag.imu.accel)):
-        assert stated == pytest.approx(estimate_noise_density(by_flag.imu.t, x), rel=0.05)
+        assert stated == pytest.approx(estimate_density_in_motion(by_flag.imu.t, x), rel=0.05)
     capsys.readouterr()  # doubts about a minute's sigmas
     assert "/imu/data" in refuse_command(capsys, "log.topic_unknown", "info", bag, "--topic", "/imu/dat")
 

@@ -283,6 +283,7 @@ def test_the_folder_holds_the_recording(name: str, options: dict[str, float], tm
 @pytest.mark.parametrize(("name", "options"), [
     ("ren2021", {"walk": 14}), ("ren2021", {"walk": 2.5}), ("ren2021", {"rate": 5.0}), ("gait", {"pace": "run"}),
     ("gait", {"imu": "phone"}), ("gait", {"course": "zigzag"}), ("gait", {"duration": 5.0}),
+    ("urban", {"duration": 9e4}), ("motorway", {"duration": 9e5}),
 ])  # fmt: skip
 def test_bad_options_are_refused(name: str, options: dict[str, float | str]) -> None:
     ((option, value),) = options.items()

@@ -53,14 +53,15 @@ def solve_drive(task: Task) -> FleetRow:
         if not task.again and (there := read_row(folder, key)) is not None:
             return {**there, "drive": task.name, "source": task.source, "skipped": True}
         outcome = run_request(_make_request(task))
-        with stage_results(folder) as part:
+        with stage_results(folder, outcome.recording.files) as part:
             outputs.write_run(outcome, part, task.pages)
         if not task.pages:
             outputs.remove_pages(folder)
         row |= {"status": DONE, **_collect_figures(outcome)}
         row["report"] = str(Path("drives") / task.name / "report.html") if task.pages else None
     except GraphnavError as error:
-        row |= {"status": REFUSED, "error": str(error)}
+        missing = error.key == "file.missing" and not Path(task.source).exists()
+        row |= {"status": REFUSED, "error": f"{task.place}: {error}" if missing and task.place else str(error)}
     except MemoryError:
         row["error"] = "out of memory; raise --memory or solve a shorter part (start, end)"
     except OSError as error:
@@ -99,7 +100,7 @@ def read_row(folder: Path, key: str | None = None) -> FleetRow | None:
 
 def hash_task(task: Task) -> str:
     """Hash of everything a result depends on: this version, all options, and every byte of input."""
-    asked = {k: v for k, v in asdict(task).items() if k not in ("name", "source", "folder", "again")}
+    asked = {k: v for k, v in asdict(task).items() if k not in ("name", "source", "folder", "again", "place")}
     asked |= {"graphnav": graphnav.__version__, "noise": task.noise and hash_file(Path(task.noise))}
     asked["input"] = [(name, hash_file(path)) for name, path in _list_inputs(task.source)]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()

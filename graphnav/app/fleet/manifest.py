@@ -58,6 +58,7 @@ class Task:
     pages: bool = True
     again: bool = False  # solve again even if it is done
     allow_outside: bool = False  # whether recordings may name files outside their folders
+    place: str = ""  # where a manifest names it
 
 
 _KNOWN_COLUMNS = ("recording", "name", *(f.name for f in fields(DriveOptions)))
@@ -94,10 +95,12 @@ def read_drives(
     if not drives:
         raise ConfigError(f"{source}: names no recording", key="manifest.no_recording")
     twice = [name for name, count in Counter(name for name, *_ in drives).items() if count > 1]
-    named = [name for where, row in rows if (name := str(row.get("name") or "")) in twice]
+    named = [(where, name) for where, row in rows if (name := str(row.get("name") or "")) in twice]
     if named:
+        where, name = named[-1]
         raise ConfigError(
-            f"{source}: two drives are named '{named[0]}'; each is a folder of its own", key="manifest.name_twice"
+            f"{where}: an earlier drive is named '{name}' as well; each is a folder of its own",
+            key="manifest.name_twice",
         )
     return _number_clones(drives)
 
@@ -120,7 +123,7 @@ def build_task(
     given = asked.noise if asked.noise is not None and Path(asked.noise).is_file() else None
     return Task(
         name, source, str(out / "drives" / name), asked.solver, settings, given, without,
-        start=asked.start, end=asked.end, **common,
+        start=asked.start, end=asked.end, place="" if where == source else where, **common,
     )  # fmt: skip
 
 
@@ -212,14 +215,18 @@ def _parse_csv(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
 
 
 def _parse_toml(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
-    values, _ = read_toml(path, ConfigError)
+    values, text = read_toml(path, ConfigError)
     drives = values.get("drive")
     if set(values) != {"drive"} or not isinstance(drives, list) or not all(isinstance(one, dict) for one in drives):
         raise ConfigError(
             f'{path}: must be a list of tables [[drive]], each with recording = "...", and nothing else',
             key="manifest.tables",
         )
-    rows: list[tuple[str, Mapping[str, Any]]] = [(f"{path}, drive {k}", one) for k, one in enumerate(drives, 1)]
+    lines = [n for n, line in enumerate(text.splitlines(), 1) if re.match(r"\s*\[\[\s*drive\s*\]\]", line)]
+    places = (
+        [f"line {n}" for n in lines] if len(lines) == len(drives) else [f"drive {k + 1}" for k in range(len(drives))]
+    )
+    rows: list[tuple[str, Mapping[str, Any]]] = [(f"{path}, {at}", one) for at, one in zip(places, drives, strict=True)]
     for where, row in rows:
         _check_columns(row, where)
     return rows

@@ -40,6 +40,7 @@ _MOVING_SIGMAS = 5.0  # sigmas of travel that count as motion: noise reaches the
 _LEAD_TIME = 10.0  # s of the span before the motion
 _MAX_ROUNDS = 10  # of headings tried and sigmas measured; few need more than two
 _OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
+_VAGUE = 10.0  # multiple of the sigma of those around: a hundredth of their weight
 # rad, of the initial headings that are tried, relative to the first guess
 _HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
 _UNLIKELY = 14.0  # difference of log-likelihoods at a ratio of one in a million: -ln 1e-6
@@ -53,10 +54,10 @@ class _End(Exception):
 
 
 def drop_implausible(recording: Recording) -> Recording:
-    """Drop the fixes that would be taken for motion: far off the running median of five.
+    """Drop the fixes that would be taken for motion, far off the running median of five, or would hide it.
 
-    The first and the last are compared with the line through the medians beside them, from which a vehicle may
-    accelerate.
+    From one much vaguer than those around it no distance is measured: a receiver's first, or one marked so. The first
+    and the last are compared with the line through the medians beside them, from which a vehicle may accelerate.
     """
     gnss = recording.gnss
     if gnss is not None and not np.isfinite(gnss.llh).all():
@@ -64,6 +65,7 @@ def drop_implausible(recording: Recording) -> Recording:
         recording = replace(recording, gnss=gnss)
     if gnss is None or len(gnss.t) < 5:
         return recording
+    gnss = pick_fixes(gnss, np.flatnonzero(average_across(gnss.sd) <= _VAGUE * _find_usual(average_across(gnss.sd))))
     p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     middle = run_median(p, 5)
     off = np.linalg.norm(p - middle, axis=1)
@@ -73,6 +75,13 @@ def drop_implausible(recording: Recording) -> Recording:
         off[end] = max(0.0, float(np.linalg.norm(p[end] - line)) - 0.5 * GRIP * abs(dt[0] * dt[1]))
     typical = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
     return replace(recording, gnss=pick_fixes(gnss, off <= _OUTLYING * typical))
+
+
+def _find_usual(sd: Array) -> Array:
+    """The median (N,) of the sigmas `sd` (N,) about each, of as many at the ends."""
+    size = min(_WANTED_FIXES, len(sd))
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(sd, size), axis=1)
+    return np.asarray(medians[np.clip(np.arange(len(sd)) - size // 2, 0, len(medians) - 1)])
 
 
 def find_motion_span(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:

@@ -220,7 +220,9 @@ def inspect(recording: Recording, screened: Screened | None = None) -> Inspectio
     if vehicle and overlap and track is not None and recording.gnss is not None and upright:
         clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
         yaw = whole.yaw or crosschecks.fit_yaw_rate(recording.imu, track)
-        if any(f.key == "gnss.velocity_axes" for f in wrong):  # their comparison with the IMU is meaningless
+        if any(
+            f.key in ("gnss.velocity_axes", "gnss.velocity_unit") for f in wrong
+        ):  # their comparison with the IMU is meaningless
             track = tracks.compute_track(replace(recording.gnss, v=None)) or track
             yaw = crosschecks.fit_yaw_rate(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places

@@ -13,6 +13,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import NEAR, UNIX, ClockOffset, compute_clock_offset
 from graphnav.recording.checks.imu import is_shaken_as_a_foot
 from graphnav.recording.checks.stated import moves_as_a_foot
+from graphnav.recording.densities import measure_densities
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, LIKELY, Agreement, compare_with_fixes
 from graphnav.recording.draft.document import Document, format_vector
@@ -189,7 +190,7 @@ class _Writer:
         else:
             front = self._write_axes(up, up_why, agreement)
         if source.log is None or (source.log.imu is not None and source.log.imu.noise_assumed):
-            self._write_noise(t, gyro, accel)
+            self._write_noise(t, gyro, accel, vehicle)
         return agreement, (t, accel @ front)
 
     def _write_axes(self, up: Array, up_why: str, agreement: Agreement) -> Array:
@@ -210,17 +211,13 @@ class _Writer:
             self.file.write_key("up", format_vector(top), up_why)
         return front
 
-    def _write_noise(self, t: Array, gyro: Array, accel: Array) -> None:
+    def _write_noise(self, t: Array, gyro: Array, accel: Array, vehicle: bool) -> None:
         self.file.lines += ['# model = "..."                             # the IMU, if docs/imu-models.md has it']
         self.file.lines += ["", "[imu.noise]                                 # better: the data sheet's figures"]
-        for key, samples, unit in (("gyro", gyro, "rad/s/sqrt(Hz)"), ("accel", accel, "m/s2/sqrt(Hz)")):
-            value = guesses.estimate_noise_density(t, samples)
-            if value > 0:
-                self.file.write_key(
-                    f"{key}_noise_density",
-                    f"{value:.2g}",
-                    f"{unit}, measured, between its quietest and usual state",
-                )
+        units = {"gyro_noise_density": "rad/s/sqrt(Hz)", "accel_noise_density": "m/s2/sqrt(Hz)"}
+        where = "between its quietest and usual state" if vehicle else "in its quietest rest or stance"
+        for key, value in measure_densities(t, gyro, accel, walks=not vehicle).items():
+            self.file.write_key(key, f"{value:g}", f"{units[key]}, measured, {where}")
 
     def _write_gnss(self, source: Source, agreement: Agreement) -> None:
         self.file.begin("gnss")

@@ -21,7 +21,6 @@ from graphnav.sensors.tables import TIME_UNITS
 _MEAN_SHARE = 0.5  # share of the typical force that is in its mean, even for a swinging foot
 _LIKELY, _CLEAR = 0.5, 0.9  # correlation
 _STRAIGHT_COSINE = np.cos(np.radians(12.0))  # cosine of the angle to a file axis below which the axis is meant
-_QUIET_SPAN = 5.0  # s
 _CALM_ROWS = 11  # rows, a stance of 0.1 s at 100 Hz
 _BACKWARD = 0.01  # share of steps backward from which rows are in no order
 _LARGEST_STEP = 100.0  # s; larger steps between stamps mean a smaller unit
@@ -213,29 +212,6 @@ def guess_axes(up: Array, forward: Array) -> tuple[str | None, tuple[Array, Arra
 def choose_forward(up: Array) -> Array:
     """A forward axis where nothing determines it: x if it is level, else y."""
     return np.asarray(np.eye(3)[0 if abs(up[0]) < 0.7 else 1])
-
-
-def estimate_noise_density(t: Array, x: Array) -> float:
-    """Noise density of samples (N, 3), taken as white: between the quietest tenth of the log and its typical state.
-
-    The Allan deviation times the root of its averaging time, which is constant for white noise; its minimum over times
-    up to half a second, as vibration raises it at short ones and motion at long ones. That of the quietest tenth is the
-    sensor's own; that of the median includes the vibration of the drive and, undesirably, its motion; the geometric
-    mean of both is returned.
-    """
-    period = float(np.median(np.diff(t)))
-    least = np.full(2, np.inf)
-    m = 1
-    while m * period <= 0.5 and len(x) // m > 4:
-        means = x[: len(x) // m * m].reshape(-1, m, x.shape[1]).mean(1)
-        squares = 0.5 * np.diff(means, axis=0) ** 2
-        n = max(round(_QUIET_SPAN / (m * period)), 4)
-        windows = squares[: len(squares) // n * n].reshape(-1, n, x.shape[1])
-        if len(windows):
-            variance = np.percentile(windows.mean(1), (10, 50), axis=0).mean(1)
-            least = np.minimum(least, np.sqrt(variance * m * period))
-        m *= 2
-    return float(np.sqrt(least[0] * least[1])) if np.isfinite(least).all() else 0.0
 
 
 def guess_pressure_unit(pressure: Array, stated: str | None) -> Guess | None:

@@ -355,7 +355,7 @@ def read_sensor(
     if (later := find_restarts(values["t"], TIME_UNITS[str(unit.value)])) is not None:  # as it will be read
         values["t"] = values["t"] + later
     order = np.argsort(values["t"], kind="stable")
-    repeated = find_repeated(path, values["t"][order])
+    repeated = find_repeated(f"{path}, column '{names['t']}'", values["t"][order])
     order = order[~repeated]
     if len(order) < 2:
         raise RecordingError(

@@ -116,7 +116,7 @@ def read_plain(path: Path) -> Plain | None:
             key="table.fields",
         )
     cells = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
-    if layout.mark != "," or '"' in text:  # else no number has a comma in it
+    if layout.mark != "," or not {'"', "'", "\u2019"}.isdisjoint(text):  # else no number has another mark in it
         cells, style = write_plainly(cells, layout.mark)
         done += style
     cells, stated = take_units_off(cells)
@@ -132,11 +132,14 @@ def _decode(data: bytes) -> tuple[str, list[str]]:
     """The text, and its encoding in words where it is not UTF-8."""
     if data[:2] in _WIDE:
         return data[: len(data) // 2 * 2].decode("utf-16", errors="replace"), ["UTF-16 text"]
-    data = data.rstrip(b"\0")
+    data, notes = data.rstrip(b"\0"), []
     try:
-        return data.decode("utf-8-sig"), []
+        text = data.decode("utf-8-sig").lstrip("\ufeff")
     except UnicodeDecodeError:
-        return data.decode("cp1252", errors="replace"), ["text of Windows"]
+        text, notes = data.decode("cp1252", errors="replace"), ["text of Windows"]
+    if "\u2212" in text:
+        text, notes = text.replace("\u2212", "-"), [*notes, "minus signs as in print"]
+    return text, notes
 
 
 def _read_lines(text: Sequence[str]) -> NumberedLines:
@@ -334,7 +337,7 @@ def _parse_date(text: str) -> datetime | None:
     try:
         month = month if month.isdigit() else str(_MONTHS.index(month.lower()) + 1)
         start = datetime(int(year), int(month), int(day))
-        rest = rest.strip(" T").replace(",", ".")
+        rest = re.sub(r" *(?:UTC|GMT)$", "Z", rest.strip(" T").replace(",", "."))
         if (seconds := _parse_clock(rest.removesuffix("Z")) if rest else 0.0) is not None:
             start = start.replace(tzinfo=UTC) if rest.endswith("Z") else start
             return start + timedelta(seconds=seconds)

@@ -68,14 +68,17 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             nothing[path.name if path.exists() else str(error)] = str(error)
             if isinstance(error.__cause__, RecordingError) or error.key == "draft.no_time":
                 refused[path] = str(error)
+            if path in paths and isinstance(error.__cause__, RecordingError) and error.key != "table.separator":
+                raise
             continue
         for sensor, source in found.items():
             every.setdefault(sensor, []).append(source)
     others = _name_others(paths, [*files, *raw.observed, *(path for some in raw.placing.values() for path in some)])
     if others:
         left.append(f"{others}: no logs of a kind that is known")
-    if nothing:
-        left.append(f"left out: {', '.join(nothing)}: no sensor is recognised in the columns; names that are: {CALLED}")
+    if unknown := [name for name, why in nothing.items() if why not in refused.values()]:
+        left.append(f"left out: {', '.join(unknown)}: no sensor is recognised in the columns; names that are: {CALLED}")
+    left += [f"left out: {why}" for why in refused.values()]
     every["gnss"], reference = separate_reference(every.get("gnss", []))
     sensors = {
         sensor: chosen for sensor, some in every.items() if (chosen := _choose_source(sensor, some, left)) is not None

@@ -234,7 +234,9 @@ def split_unit(name: str) -> tuple[str, str]:
     plain = re.sub(r"[^a-z0-9]+", "_", base.lower()).strip("_")
     if bracket:
         unit = bracket[1].lower().replace("²", "2").replace("°", "deg").replace("µ", "u").replace("^", "")
-        return plain, re.sub(r"[^a-z0-9]+", "_", unit).strip("_")
+        unit = re.sub(r"[^a-z0-9]+", "_", unit).strip("_")
+        again, same = split_unit(base)  # as in "lat_deg [deg]"
+        return again if same and NAMED_UNITS.get(same) == NAMED_UNITS.get(unit) else plain, unit
     words = plain.split("_")
     for count in (3, 2, 1):
         unit = "_".join(words[-count:])

@@ -27,7 +27,8 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, date_week_times
 from graphnav.recording import Gnss, Imu, Truth, convert_fix_types
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import DEFAULT_SD_V, LATEST
+from graphnav.recording.formats.repair import DEFAULT_SD_V
+from graphnav.sensors.tables import LATEST
 
 _HEADER = re.compile(rb"[#%][A-Z][A-Z0-9]{3,}A,[^;\r\n]{4,200};")
 _BEGIN = re.compile(rb"[#%](?=[A-Z]{3})")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +13,9 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import UNIX, find_restarts
 from graphnav.recording import FIX_TYPES, convert_fix_types
 from graphnav.recording.formats.table import Selection, Table
-from graphnav.sensors.tables import TIME_UNITS, Keep
+from graphnav.sensors.tables import LATEST, TIME_UNITS, Keep
 
 _SENSOR_LABELS = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
-LATEST = 1e11  # s, either sign: three thousand years
 VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a larger sigma carries no information
 _LEAST_SIGMA = 1e-9  # m, m/s; a smaller sigma is not meant as one
 _SET_BACK_PERIODS = 10.0  # periods; rows that overtake each other are closer
@@ -112,7 +110,7 @@ def select_usable_rows(
         )
         rows = rows.take(np.argsort(t, kind="stable"))
         t = rows["t"]
-    repeated = find_repeated(rows.path, t)
+    repeated = find_repeated(f"{rows.path}, column '{rows.file_names['t']}'", t)
     if repeated.any():
         remarks.add(
             f"{sensor}.rows_repeated",
@@ -138,8 +136,8 @@ def _tell_rounding(stamps: Array, repeated: NDArray[np.bool_]) -> str:
     return f": stamps are rounded to {step:g}, as single-precision numbers are; write them with double precision"
 
 
-def find_repeated(path: Path, t: Array) -> NDArray[np.bool_]:
-    """(N,) mask of stamps, in order, that equal the previous one.
+def find_repeated(where: str, t: Array) -> NDArray[np.bool_]:
+    """(N,) mask of stamps, in order, that equal the previous one; `where` they are, in words.
 
     Raises
     ------
@@ -147,9 +145,9 @@ def find_repeated(path: Path, t: Array) -> NDArray[np.bool_]:
         If most are.
     """
     repeated = np.r_[False, np.diff(t) == 0]
-    if repeated.mean() > _REPEATED and (~repeated).sum() > 1:
+    if repeated.mean() > _REPEATED:
         raise RecordingError(
-            f"{path}: {format_row_count(repeated, '')} of {len(t)} with the time of the row before: the fraction of "
+            f"{where}: {format_row_count(repeated, '')} of {len(t)} with the time of the row before: the fraction of "
             "the seconds was lost, or several rows are stamped at once; log the time of each, with milliseconds",
             key="table.times_repeated",
         )

@@ -19,7 +19,7 @@ from pydantic import (
 )
 from pydantic.types import Strict
 
-from graphnav.core.complaints import describe_invalid, read_toml, shorten, suggest_nearest
+from graphnav.core.complaints import describe_invalid, describe_place, read_toml, shorten, suggest_nearest
 from graphnav.core.earth import MG, STANDARD_GRAVITY
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
@@ -32,6 +32,7 @@ from graphnav.sensors import list_sensors
 from graphnav.sensors.tables import (
     NotNegative,
     Number,
+    Offset,
     Positive,
     SensorTable,
     TimeUnit,
@@ -219,7 +220,7 @@ class RawGnssTable(TomlTable):
     base: Files | None = Field(None, description="RINEX observations of a base station")
     base_position: Vector | None = Field(None, description="m, Earth-centred, of its antenna")
     lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
-    time_offset: Number = Field(0.0, description="s, added to the receiver's stamps on the recording's clock")
+    time_offset: Offset = Field(0.0, description="s, added to the receiver's stamps on the recording's clock")
     columns: dict[str, str] = Field({}, description="of a CSV file: our name = the file's")
     corrected: tuple[Literal["clock", "troposphere"], ...] = Field(
         (), description="corrections already applied to the codes"
@@ -372,6 +373,7 @@ def read_description(path: Path) -> RecordingFile:
         _ = description.imu.R_bs
     except ValueError as error:
         axes = description.imu.axes
-        where = "'imu': " if axes is None else f"'imu.axes' = '{axes}' "
-        raise RecordingError(f"{path}: {where}{error}", key="key.value") from None
+        which = "'imu': " if axes is None else f"'imu.axes' = '{axes}' "
+        where = describe_place(path, text, ("imu",) if axes is None else ("imu", "axes"))
+        raise RecordingError(f"{where}{which}{error}", key="key.value") from None
     return description

@@ -14,7 +14,8 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.recording import Gnss, take_rows
 from graphnav.recording.formats.places import is_on_earth
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V
+from graphnav.recording.formats.repair import VAGUEST, VAGUEST_V
+from graphnav.sensors.tables import LATEST
 
 
 def drop_unsound_rows(log: Log, path: Path) -> Log:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import re
 import warnings
@@ -25,6 +26,16 @@ _BLANK_CELL = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empt
 # which units hold as well
 _COMMENT = re.compile(r"(?m)(^|[^,\s])(?<!1\.)[ \t]*#.*|^[ \t]*%.*")
 _EMPTY = "is empty, or holds comments (#) alone; copy the log again, or leave this file out"
+_OTHERS = {  # by how the first line begins
+    "version https://git-lfs": "a pointer of Git LFS (git lfs pull fetches the file)",
+    "<!": "a web page",
+    "<html": "a web page",
+    "<?xml": "XML",
+    "{": "JSON",
+}
+_TIME_OF_DAY = re.compile(
+    r"(?:\d+-\d+-\d+[T ])?\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d*)?)?\s*(?:Z|UTC|GMT|[+-]\d\d:?\d\d|([A-Z]{2,5}))?"
+)
 _MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # separators, in the order of their tests
 
 
@@ -165,7 +176,7 @@ def read_first_rows(path: Path, count: int) -> list[list[str]]:
         raise RecordingError(
             f"{path}: holds bytes that are not UTF-8 text; save it as UTF-8", key="file.text"
         ) from None
-    return [[cell.strip().strip('"') for cell in line.split(",")] for line in lines]
+    return [_split(line) for line in lines]
 
 
 def _open(path: Path) -> IO[str]:
@@ -215,9 +226,11 @@ def _find_header(path: Path) -> tuple[int, list[str]]:
         line = _COMMENT.sub(r"\1", line).strip()
         if not line:
             continue
-        names = [name.strip().strip('"') for name in line.split(",")]
+        names = _split(line.lstrip("\ufeff"))
         if "\ufffd" in line:
             raise RecordingError(f"{path}, line {number}: is not UTF-8 text; save it as UTF-8", key="file.text")
+        if other := next((words for start, words in _OTHERS.items() if line.startswith(start)), None):
+            raise RecordingError(f"{path}: is {other}, not a CSV table", key="file.no_table")
         mark = next((words for one, words in _MARKS.items() if one in line), None)
         if len(names) == 1 and mark is not None:
             raise RecordingError(
@@ -232,6 +245,12 @@ def _find_header(path: Path) -> tuple[int, list[str]]:
             )
         return number, names
     raise RecordingError(f"{path}: {_EMPTY}", key="file.empty")
+
+
+def _split(line: str) -> list[str]:
+    """The cells of a line; a comma within quotes does not separate two."""
+    cells = next(csv.reader([line], skipinitialspace=True)) if '"' in line else line.split(",")
+    return [cell.strip().strip('"') for cell in cells]
 
 
 def _is_number(text: str) -> bool:
@@ -301,16 +320,18 @@ def _list_lines(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
 
 def _suggest_cause(cell: str, cells: list[str], header: list[str], use: list[int]) -> str:
     """The likely meaning of a cell that is not a number, and what to do."""
-    bare = [one.strip('"') for one in cells]
-    if bare == header:
+    if cells == header:
         return "; the header is there again: cut the file in two there, or take the line out"
-    if sorted(bare) == sorted(header):
+    if sorted(cells) == sorted(header):
         return "; the header is there again, in another order: cut the file in two there"
-    if re.fullmatch(r"(\d+-\d+-\d+[T ])?\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?Z?", cell):
-        return "; it is a time of day: write seconds, or let graphnav init do it"
+    if found := _TIME_OF_DAY.fullmatch(cell):
+        zone = f", and {found[1]} as its offset, such as +09:00" if found[1] else ""
+        return f"; it is a time of day: write seconds, or let graphnav init do it{zone}"
     if re.match(r"\d+[-/.]\d+[-/.]\d+\b", cell):
         return "; it is a date: write seconds, or year-month-day, of which graphnav init makes them"
-    if not any(_is_number(cells[k].strip('"')) for k in use):
+    if _is_number(re.sub("['\u2019\u2212\u00a0\u202f ]", "", cell)):  # marks between thousands, a minus as in print
+        return "; write it with ASCII digits and - alone, or let graphnav init do it"
+    if not any(_is_number(cells[k]) for k in use):
         return "; if the line holds units, take it out, or let graphnav init do it"
     if re.fullmatch(r"[-+]?\d+(\.\d*)?([eE][-+]?\d+)?\s*[A-Za-z%°][\w/²^]*", cell):
         return "; write the number alone, and its unit in units, or let graphnav init do it"
@@ -321,7 +342,7 @@ def _parse_cells(path: Path, text: str, header: list[str], use: list[int]) -> Ar
     """The slow parser, which reports what is wrong and where."""
     rows = []
     for number, line in _list_lines(text.splitlines()):
-        cells = [cell.strip() for cell in line.split(",")]
+        cells = _split(line)
         if "\0" in line:
             raise RecordingError(
                 f"{path}, line {number}: holds bytes that are 0, as after a loss of power: take the line out",
@@ -334,7 +355,7 @@ def _parse_cells(path: Path, text: str, header: list[str], use: list[int]) -> Ar
             )
         row = []
         for column in use:
-            cell = cells[column].strip('"')
+            cell = cells[column]
             try:
                 row.append(np.nan if is_blank(cell) else parse_number(cell))
             except ValueError:

@@ -30,10 +30,10 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.formats.columns import match_attitude, match_columns
-from graphnav.recording.formats.repair import LATEST
 from graphnav.recording.formats.rtklib_solution import parse_solution
 from graphnav.recording.formats.schema import HEIGHT, SPEED
 from graphnav.recording.formats.text import parse_table, split_lines
+from graphnav.sensors.tables import LATEST
 
 _RTKLIB = re.compile(r"program\s*:|\bQ\b.*\bns\b")  # of its header, other programs have comments from % as well
 _MAX_COORDINATE = 1e8  # m, twice around the Earth, whatever the coordinates' origin

@@ -18,12 +18,14 @@ from graphnav.recording import Gnss, Recording, take_rows
 FASTEST = 150.0  # m/s; the fastest cars that can be bought reach 490 km/h, 136 m/s
 # A receiver cannot follow a reflection that comes more than one and a half code chips late (GPS C/A: 293 m a chip).
 MISLED = 440.0  # m
+_IMPROBABLE = 5.0 * np.sqrt(2.0)  # ratio of a distance between two fixes to their scatter
 _CACHED = 60.0  # s; a receiver that is switched on outputs fixes at least that often
 _FROZEN = (60.0, 300.0)  # s, and m driven: within these a road or receiver noise changes a height
 _STEEPEST = 0.1  # steepest road: bound on the deviation of a height
 _FINEST_PHASE = 1e-3  # m: a two-hundredth of the carrier's wavelength (0.19 m), the resolution of its phase
 _WAVE = 0.19  # m, of L1
 _ACCELERATION = 2.0  # m/s^2, typical acceleration of vehicles
+_WANDER = 30.0  # m, by which fixes of a place may wander
 _UNBELIEVED = 10.0  # ratio to the scatter of adjacent fixes that no true sigma has: errors last, scatter is smaller
 _SMOOTH = 2e-3  # of the sigma; filtered fixes of phones scatter by five thousandths
 GRIP = 8.0  # m/s^2, grip of tyres
@@ -56,6 +58,10 @@ def screen_fixes(recording: Recording) -> tuple[Recording, list[Finding]]:
         findings.append(_drop_unreachable(gnss, p, off, recording.start))
         gnss = take_rows(gnss, ~off)
         p = _compute_positions(gnss)
+    if (away := _measure_misled(gnss, p)) > _WANDER:
+        words = f"the fixes state the same velocity throughout and move otherwise, by {away:.3g} m"
+        findings.append(Finding("warning", f"{words}: it was not logged; not used", "gnss.velocity_constant"))
+        gnss = replace(gnss, v=None, sd_v=None)
     for a, b in find_frozen_heights(gnss, p):
         driven = float(np.hypot(*np.diff(p[a:b, :2], axis=0).T).sum())
         sd = gnss.sd.copy()
@@ -78,6 +84,18 @@ def screen_fixes(recording: Recording) -> tuple[Recording, list[Finding]]:
     return replace(recording, gnss=gnss), findings
 
 
+def _measure_misled(gnss: Gnss, p: Array) -> float:
+    """Distance (m) of a tenth of the fixes from where a velocity that is the same in all leads, beyond their sigmas."""
+    if gnss.v is None:
+        return 0.0
+    known = np.isfinite(gnss.v[:, :2]).all(axis=1) & np.isfinite(p).all(axis=1)
+    if known.sum() < 10 or np.ptp(gnss.v[known][:, :2], axis=0).any():
+        return 0.0
+    off = p[known, :2] - np.outer(gnss.t[known], gnss.v[known][0, :2])
+    sd = float(np.median(gnss.sd[known, :2]))
+    return max(float(np.percentile(np.linalg.norm(off - np.median(off, axis=0), axis=1), 90.0)) - 5.0 * sd, 0.0)
+
+
 def count_cached_fixes(t: Array, start: float) -> int:
     """Number of the first fixes at t (M,) s that precede the IMU's start by long, with none for as long after them."""
     before = np.flatnonzero((t[:-1] < start - _CACHED) & (np.diff(t) > _CACHED))
@@ -91,13 +109,27 @@ def _compute_positions(gnss: Gnss) -> Array:
 
 
 def find_out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
-    """Fixes at p (M, 3) m, t (M,) s, that cannot be reached from the largest consistent set."""
+    """Fixes at p (M, 3) m, t (M,) s, that cannot be reached from the largest consistent set.
+
+    Where that set itself scatters so much that its fixes may be as far apart, it is the noise, and no fix is wrong.
+    """
+    error = MISLED
+    while True:
+        lost = _find_unreachable(t, p, error)
+        scatter = _measure_scatter(t[~lost], p[~lost])
+        if not lost.any() or not _IMPROBABLE * scatter > error:
+            return lost
+        error = _IMPROBABLE * scatter  # of a set from which less is cut, so that it scatters more
+
+
+def _find_unreachable(t: Array, p: Array, error: float) -> NDArray[np.bool_]:
+    """Fixes outside the largest set in which each is reached from the one before, with `error` m between them."""
     lost = np.zeros(len(t), dtype=bool)
     there = np.flatnonzero(np.isfinite(p).all(axis=1))
     if len(there) < 3:
         return lost
     t, p = t[there], p[there]
-    far = np.linalg.norm(np.diff(p, axis=0), axis=1) > FASTEST * np.diff(t) + MISLED
+    far = np.linalg.norm(np.diff(p, axis=0), axis=1) > FASTEST * np.diff(t) + error
     if not far.any():
         return lost
     edges = np.r_[0, np.flatnonzero(far) + 1, len(t)]
@@ -106,7 +138,7 @@ def find_out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
     best, before = (last - first + 1).astype(float), np.full(len(first), -1)
     for k in range(1, len(first)):
         apart = np.linalg.norm(p[first[k]] - p[last[:k]], axis=1)
-        count = np.where(apart <= FASTEST * (t[first[k]] - t[last[:k]]) + MISLED, best[:k], 0.0)
+        count = np.where(apart <= FASTEST * (t[first[k]] - t[last[:k]]) + error, best[:k], 0.0)
         if count.max() > 0.0:
             before[k] = int(np.argmax(count))
             best[k] += count.max()
@@ -147,11 +179,20 @@ def find_frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
     ]
 
 
-def _compute_steps(gnss: Gnss) -> tuple[Array, float, NDArray[np.bool_]]:
+def _compute_steps(t: Array) -> tuple[Array, float, NDArray[np.bool_]]:
     """Time steps, their median, and which are not gaps."""
-    dt = np.diff(gnss.t)
-    period = float(np.median(dt))
+    dt = np.diff(t)
+    period = float(np.median(dt)) if len(dt) else np.nan
     return dt, period, dt < 1.9 * period
+
+
+def _measure_scatter(t: Array, p: Array) -> float:
+    """Standard deviation (m) per horizontal axis of fixes at p (M, 3) about their neighbours; NaN of too few."""
+    near = _compute_steps(t)[2]
+    bend = (p[2:] - 2.0 * p[1:-1] + p[:-2])[near[1:] & near[:-1], :2]
+    bend = bend[np.isfinite(bend).all(axis=1)]
+    # white errors of s have second differences of s sqrt(6)
+    return float(np.median(np.abs(bend))) / 0.6745 / np.sqrt(6.0) if len(bend) >= 10 else float("nan")
 
 
 def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
@@ -159,13 +200,8 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
     changed.
     """
     sd = float(np.median(gnss.sd[:, :2]))
-    _, period, near = _compute_steps(gnss)
-    pairs = near[1:] & near[:-1]
-    bend = (p[2:] - 2.0 * p[1:-1] + p[:-2])[pairs, :2]
-    bend = bend[np.isfinite(bend).all(axis=1)]
-    # white errors of s have second differences of s sqrt(6)
-    scatter = float(np.median(np.abs(bend))) / 0.6745 / np.sqrt(6.0) if len(bend) >= 10 else float("nan")
-    driven = _ACCELERATION * period**2 / np.sqrt(6.0)
+    scatter = _measure_scatter(gnss.t, p)
+    driven = _ACCELERATION * _compute_steps(gnss.t)[1] ** 2 / np.sqrt(6.0)
     if sd < _FINEST_PHASE:
         yield Finding(
             "warning",
@@ -201,10 +237,11 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
 def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     """Fixes that alternate between two places a constant step apart, which leaves open which are right."""
     there: NDArray[np.bool_] = np.asarray(np.isfinite(p).all(axis=1))
+    there[1:] &= (np.diff(gnss.llh, axis=0) != 0.0).any(axis=1)  # a place that is held is no group
     if there.sum() < 2 * _MEAN_OF:
         return
     gnss, p = take_rows(gnss, there), p[there, :2]
-    dt, period, _ = _compute_steps(gnss)
+    dt, period, _ = _compute_steps(gnss.t)
     jump = _find_jumps(p, dt)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
     # the speed changes by the grip of tyres over half the window; steps over a long gap are not used

@@ -26,7 +26,7 @@ _SPEED_RATE = 10.0  # Hz needed for changes of speed
 def screen_odometer(recording: Recording, track: Track | None) -> tuple[Recording, list[Finding]]:
     """The recording without impossible readings, and findings; `track` is the velocity by GNSS."""
     findings: list[Finding] = []
-    for one in (_find_beyond, _find_clock_jump, _find_other_scale):
+    for one in (_find_beyond, _find_stuck, _find_clock_jump, _find_other_scale):
         odometer = recording.odometer
         if odometer is None or len(odometer.t) < 2:
             break
@@ -63,6 +63,20 @@ def _find_beyond(odometer: Odometer, track: Track | None, start: float) -> _Foun
         f"{many} beyond any vehicle's speed (the first {odometer.speed[k]:.4g} m/s at {odometer.t[k] - start:.2f} s "
         f"from the start; nothing on land is faster than {FASTEST:g} m/s): not used",
         "odometer.beyond",
+    )
+
+
+def _find_stuck(odometer: Odometer, track: Track | None, start: float) -> _Found:
+    """All readings, where they are the same and the fixes are not as steady."""
+    same = bool((odometer.speed == odometer.speed[0]).all())
+    bad = np.full(len(odometer.t), same)
+    if not same or track is None or len(track.t) < MIN_PAIRS or np.ptp(track.speed) < _LEAST_SPEED:
+        return np.zeros_like(bad), None
+    return bad, Finding(
+        "warning",
+        f"the odometer reads {odometer.speed[0]:.4g} m/s throughout while the fixes speed up or slow down: it is stuck "
+        "or was not logged; not used",
+        "odometer.constant",
     )
 
 

@@ -332,8 +332,14 @@ def _list_rows(bad: NDArray[np.bool_]) -> str:
 
 
 def check_dead_axes(recording: Recording) -> Iterator[Finding]:
-    """An axis that repeats one value while the others of its sensor change."""
+    """An axis that repeats one value while the others of its sensor change, or all of them while the other drives."""
     imu = recording.imu
+    pair = {"gyro": (imu.gyro, imu.accel, 0.1), "accelerometer": (imu.accel, imu.gyro, 0.01)}  # m/s^2, rad/s
+    for name, (values, other, least) in pair.items():
+        if (np.ptp(values, axis=0) == 0.0).all() and _measure_swing(imu.t, other) > least:
+            words = "reads the same throughout while the IMU moves: it is defective or was not logged"
+            yield Finding("refused", f"the {name} {words}", "imu.dead_axis")
+            return
     period = compute_period(imu.t)
     whole = recording.duration
     for name, values in (("gyro", imu.gyro), ("accelerometer", imu.accel)):
@@ -361,6 +367,12 @@ def check_dead_axes(recording: Recording) -> Iterator[Finding]:
                 + ("" if when == "throughout" else "; use what lies before or after (--start, --end)"),
                 "imu.dead_axis",
             )
+
+
+def _measure_swing(t: Array, x: Array) -> float:
+    """The largest standard deviation of means of readings (N, 3) over a second, which no vibration moves."""
+    n = max(round(1.0 / compute_period(t)), 1)
+    return float(x[: len(x) // n * n].reshape(-1, n, 3).mean(axis=1).std(axis=0).max(initial=0.0))
 
 
 def _compare_repeats(x: Array) -> tuple[Array, Array]:
