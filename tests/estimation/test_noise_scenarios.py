@@ -347,6 +347,26 @@ def test_the_first_fixes_after_an_outage_are_wrong_and_not_the_later_ones(
         assert summarise(metrics)["nees_p"] < chi2.isf(1e-3, 3) / 3, solver
 
 
+def test_a_minute_in_which_fixes_drift_is_left_out(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A car among high buildings; an IMU disturbed where the drift begins and ends, and a wheel that slips all the time
+    between, are nearly as likely.
+    """
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    clean = load(shared_data / "tokyo_20201105").crop(700.0, 900.0)
+    assert clean.gnss is not None
+    drifting = importlib.import_module("damage").drifting(clean, clean.gnss, np.random.default_rng(0))
+    frame = LocalFrame(clean.gnss.llh[0])
+    off = np.linalg.norm(frame.from_llh(drifting.llh) - frame.from_llh(clean.gnss.llh), axis=1)
+    wrong = clean.gnss.t[off > 0.1]  # of up to 18 m
+    damaged = replace(clean, gnss=drifting)
+    found = run(damaged, parse_settings({}), ("rts",))
+    (metrics,) = score(clean, damaged, found, ())[0].values()
+    assert summarise(metrics)["nees_p"] < chi2.isf(1e-3, 3) / 3
+    begin, end = (edge(x for one in found["rts"].excluded for x in (one.t_start, one.t_end)) for edge in (min, max))
+    assert abs(begin - wrong[0]) < 10.0
+    assert wrong[-1] <= end < wrong[-1] + 10.0
+
+
 def test_stamps_of_an_imu_that_jitter_make_nothing_worse(monkeypatch: pytest.MonkeyPatch) -> None:
     """An IMU stamped on arrival, late by up to four tenths of its period, beside a row that its neighbours contradict:
     spans are left out that the start rests on, and a filter from a start without them diverges.
