@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -35,8 +36,10 @@ from graphnav.estimation.joint_estimate import JointEstimate
 from graphnav.estimation.noise.apply import apply_noise, are_of_others, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.chords import find_filled_gaps
+from graphnav.estimation.noise.decision import weigh_rest
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
+from graphnav.estimation.noise.spans import Span
 from graphnav.estimation.noise.tails import widen_by_tails, widen_unweighted
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_in_gaps, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
@@ -149,6 +152,12 @@ class Begun:
             return None
         best = self.found.estimate.noise
         return NoiseModel(best.figures, best.times, tails=best.tails)
+
+    def weigh_measurements(self, some: Mapping[str, tuple[Span, ...]]) -> float:
+        """By how much the logarithm of the evidence falls without rows at some times, by constraint."""
+        assert self.found is not None
+        self.passes.update(filter=1)
+        return self.found.estimate.log_evidence - weigh_rest(self.found.base, self.found.estimate, some)
 
     def estimate_parameters(self) -> tuple[Problem, Array, Array] | None:
         """The problem, its parameters (D-15,) at the end and their covariance; None where no stamp is far off."""

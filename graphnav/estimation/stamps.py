@@ -23,13 +23,16 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LINEAR_OFFSET
+from graphnav.constraints.base import SAME_TIME, Constraint
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
 from graphnav.constraints.odometer import ODOMETER_DELAY
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import shift_stamps, shift_stamps_back
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
+from graphnav.estimation.noise.spans import Span
 from graphnav.estimation.noise_search import Weigh
 from graphnav.estimation.offsets import AS_STATED, is_offset_far, list_end_rows, move_stamps
 from graphnav.estimation.preparation import Begun, Prepared
@@ -39,6 +42,7 @@ from graphnav.estimation.solvers.linearise import Points, shift
 from graphnav.recording import Recording
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, is_certain
 
+_OWN_STAMPS = GnssPosition.name, GnssVelocity.name
 _SIGNIFICANT = 3.0  # sigmas
 _MOVES = 3  # of moving the stamps
 _A_PPM = 1e-6
@@ -64,6 +68,37 @@ class _Candidate:
     @property
     def passes(self) -> Counter[str]:
         return self.begun.all_passes if self.prepared is None else self.prepared.passes
+
+    def compare_evidence(self, other: _Candidate) -> float:
+        """The logarithm of the evidence less that of another, both of as many measurements: with its stamps moved a fix
+        may leave the span of the IMU, and a keyframe with what is assumed there goes with it.
+        """
+        return self._weigh_common(other) - other._weigh_common(self)
+
+    def _weigh_common(self, other: _Candidate) -> float:
+        one, their = self.begun.found, other.begun.found
+        assert one is not None
+        assert their is not None
+        theirs = {rows.name: other._list_stamps(their.base, rows) for rows in their.base.constraints}
+        beyond: dict[str, tuple[Span, ...]] = {}
+        for rows in one.base.constraints:
+            t, same = self._list_stamps(one.base, rows), theirs.get(rows.name, np.empty(0))
+            if rows.name in _OWN_STAMPS:
+                apart = np.abs(same[pick_nearest(same, t)] - t) if len(same) else np.full(len(t), np.inf)
+                lacking = apart > 10.0 * SAME_TIME  # both rounded
+            else:  # at keyframes, of which any are alike
+                kept = np.linspace(0.0, len(t) - 1.0, min(len(same), len(t))).round().astype(int)
+                lacking = ~np.isin(np.arange(len(t)), kept)
+            if lacking.any():
+                beyond[rows.name] = tuple((x, x) for x in one.base.t[rows.keyframe][lacking].tolist())
+        return self.log_evidence - self.begun.weigh_measurements(beyond) if beyond else self.log_evidence
+
+    def _list_stamps(self, problem: Problem, rows: Constraint) -> Array:
+        """(N,) s, on their own clock, of fixes; of other rows the times of their keyframes."""
+        t, by = problem.t[rows.keyframe], _list_by_constraint(self.offsets)
+        if rows.name not in by:
+            return t
+        return np.asarray(shift_stamps_back(t, by[rows.name], self.offsets.rate, self.offsets.since))
 
 
 # stamp offsets, and what was begun with others, if anything -> the recording with its stamps moved by these
@@ -121,7 +156,7 @@ def _find(move: _Move, plain: _Candidate, guess: StampOffsets | None = None) -> 
         with contextlib.suppress(*BREAKDOWN):  # with stamps that are farther off than before
             start = move(first, None) if isinstance(first, StampOffsets) else first
             found = _move_until_near(move, start)
-            if found is not None and found is not plain and found.log_evidence > plain.log_evidence:
+            if found is not None and found is not plain and found.compare_evidence(plain) > 0.0:
                 return found
     return plain
 
