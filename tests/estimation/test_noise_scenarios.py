@@ -347,6 +347,15 @@ def test_the_first_fixes_after_an_outage_are_wrong_and_not_the_later_ones(
         assert summarise(metrics)["nees_p"] < chi2.isf(1e-3, 3) / 3, solver
 
 
+def test_stamps_are_moved_though_a_fix_leaves_the_span_of_the_imu(
+    shared_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stamps up to half a second late and an antenna 0.5 m off: as stated there are two more keyframes of a stop."""
+    _, clean, damaged = draw_damaged(shared_data, monkeypatch, 8118, 6)
+    (metrics,) = score(clean, damaged, run(damaged, parse_settings({}), ("rts",)), ())[0].values()
+    assert summarise(metrics)["nees_p"] < chi2.isf(1e-3, 3) / 3
+
+
 def test_a_minute_in_which_fixes_drift_is_left_out(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A car among high buildings; an IMU disturbed where the drift begins and ends, and a wheel that slips all the time
     between, are nearly as likely.
