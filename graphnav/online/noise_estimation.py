@@ -150,10 +150,23 @@ def run_estimation(task: EstimationTask) -> EstimationResult:
         words = (*describe_freed(noise.freed, task.recording), *describe_noise(noise, used))
         wrong = find_fault_spans(used)
         noise = widen_unweighted(used, _convert_unit(noise, base, task.unit))
-        noise = replace(noise, false_stops=unite_stops(before.false_stops, false))
+        noise = replace(_expect_variances(noise), false_stops=unite_stops(before.false_stops, false))
         return EstimationResult(noise, words, stationary, wrong, check_rows(task.every), start, points, anew)
     except np.linalg.LinAlgError as error:
         raise EstimationError(str(error), key="solver.undetermined") from error
+
+
+def _expect_variances(noise: NoiseModel) -> NoiseModel:
+    """The noise model with the means of variances in place of their most likely values, which few rows leave open.
+
+    Where variances are uncertain, the best of all linear filters is the one with their means; that of a log-normal
+    distribution of median m is m exp(s^2 / 2). Errors that last for hours stay as they are: no later row will tell.
+    """
+    figures = {
+        name: one if f".{TIMES[-1]}." in name else replace(one, log_factor=one.log_factor + 0.5 * one.sigma**2)
+        for name, one in noise.figures.items()
+    }
+    return replace(noise, figures=figures)
 
 
 def _align_again(task: EstimationTask, stationary: Array, noise: NoiseModel) -> Alignment:
