@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C ends it in one line from the first import on.
+    """Run the command line; Ctrl-C, and SIGTERM as well, ends it in one line from the first import on.
 
     Streams that a service has closed are opened to nowhere: files would take their numbers.
     """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     while (spare := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(spare)

@@ -581,6 +581,7 @@ MISTAKES: dict[str, list[Mistake]] = {
             True,
         ),
         Mistake("a source mistyped", nothing, ("did you mean 'gnss'?",), (*SMOOTH, "--without", "gns:10-20"), True),
+        Mistake("no such scenario", nothing, ("'city'", "urban"), ("simulate", "city", "-o", "simulated"), True),
         Mistake(
             "a span outside the recording",
             nothing,

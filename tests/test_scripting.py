@@ -25,6 +25,7 @@ from graphnav.config import PROFILES, Settings, format_settings, parse_settings,
 from graphnav.core import staging
 from graphnav.core.errors import ConfigError, EstimationError
 from graphnav.core.progress import send_progress, tell
+from graphnav.estimation import pipeline
 from graphnav.evaluation import gates
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -250,8 +251,12 @@ def test_a_staged_folder_replaces_at_the_end_or_not_at_all(tmp_path):
     assert not (tmp_path / "x").exists()
 
 
-def test_what_was_read_is_not_replaced(tmp_path, capsys):
-    """A truth, a trajectory to compare with or to convert, of the name of a result, in the folder of the results."""
+def test_what_is_read_is_not_replaced(tmp_path, capsys, monkeypatch):
+    """A truth, a trajectory to compare with or to convert, of the name of a result, in the folder of the results.
+
+    It is refused before anything is solved.
+    """
+    monkeypatch.setattr(pipeline, "run", lambda *_: pytest.fail("solved"))
     shutil.copytree(TOKYO, tmp_path, dirs_exist_ok=True)
     truth = tmp_path / "trajectory.csv"
     truth.write_bytes(gzip.decompress((tmp_path / "truth.csv.gz").read_bytes()))
@@ -271,17 +276,22 @@ def test_what_was_read_is_not_replaced(tmp_path, capsys):
         assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_ctrl_c_waits_for_what_must_not_be_cut():
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_end_waits_for_what_must_not_be_cut(number):
     done = []
 
     def move():
         with staging.defer_interrupts():
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
             done.append("moved")
         done.append("more")
 
-    with pytest.raises(KeyboardInterrupt):
-        move()
+    before = signal.signal(number, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            move()
+    finally:
+        signal.signal(number, before)
     assert done == ["moved"]
 
 
@@ -303,7 +313,8 @@ def test_on_a_full_disk_are_the_new_results_or_the_older(tmp_path, end):
         assert after == before
 
 
-def test_ctrl_c_is_one_line_and_leaves_nothing_half_done(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_end_is_one_line_and_leaves_nothing_half_done(tmp_path, number):
     """On a terminal, as soon as the bar is up."""
     main, end = pty.openpty()
     command = [PROGRAM, "compare", "kitti", "-o", tmp_path / "out"]
@@ -312,7 +323,7 @@ def test_ctrl_c_is_one_line_and_leaves_nothing_half_done(tmp_path):
         shown = b""
         while not shown:
             shown = os.read(main, 4096)
-        run.send_signal(signal.SIGINT)
+        run.send_signal(number)
         try:
             while more := os.read(main, 4096):
                 shown += more

@@ -278,7 +278,7 @@ def _solve_and_write(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
         {k: v for k, v in given.items() if v is not None}, noise, exported=exported, point=point,
         topics=tuple(asked.topic or ()), format=asked.format, allow_outside=asked.allow_outside, against=tuple(against),
-        judge_arms=not alone, loose=loose,
+        judge_arms=not alone, loose=loose, folder=folder, results=outputs.list_results(() if alone else names),
     )  # fmt: skip
     with show_progress(asked.quiet, *chosen) as progress, allow_second_process():
         outcome = workflow.run_request(request, progress, reading)

@@ -88,6 +88,11 @@ def check_output_folder(path: str | Path, files: Sequence[str] = (), folders: Se
     return folder
 
 
+def list_results(folders: Sequence[str]) -> tuple[str, ...]:
+    """The names of the files that a run writes: of each solver's folder, or of the run's if there are none."""
+    return (*FILES, stored.RUN_FILE, *(f"{folder}/{name}" for folder in folders for name in FILES))
+
+
 def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
     """Write all files of a run with a single solver into `folder`; returns the files to look at first.
 

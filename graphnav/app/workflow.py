@@ -27,6 +27,7 @@ from graphnav.core.interpolation import pick_nearest
 from graphnav.core.memory import return_memory
 from graphnav.core.notes import Note, Notes, format_count, get_key
 from graphnav.core.progress import Progress, send_progress, tell
+from graphnav.core.staging import keep_inputs
 from graphnav.estimation.names import name_rows
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, StampOffsets
 from graphnav.estimation.solution import Solution
@@ -70,6 +71,8 @@ class Request:
     point: str | None = None  # "antenna", "imu" or a lever arm
     judge_arms: bool = False  # check the signs of lever arms even if nothing is in doubt
     loose: bool = False  # also solve with fixes in place of raw observations
+    folder: Path | None = None  # where results are to be written, with which names: no file that is read is one
+    results: tuple[str, ...] = ()
 
     @property
     def part(self) -> AskedPart:
@@ -173,6 +176,9 @@ def _solve_request(
     load_solvers(request.solvers)  # which takes as long
     found = reading.get_result()
     recording, zero, timings = found.recording, found.zero, found.timings
+    if request.folder is not None:
+        targets = (request.folder / name for name in request.results)
+        keep_inputs(request.folder, targets, (*recording.files, *(one.path for one in request.against)))
     check_names(request.exported, recording.gps_zero)
     if request.point == "antenna" and recording.gnss is None:
         raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")

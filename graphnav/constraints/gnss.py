@@ -107,6 +107,14 @@ def _build_stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
     )
 
 
+def _space_nodes(processes: tuple[Parameter, ...], spacing: float) -> tuple[Parameter, ...]:
+    """Processes of a part of a drive, with nodes so far apart (s): it may not show how close fixes come. An error of a
+    single fix, or in units of each fix, has one at every keyframe.
+    """
+    each = STAMP_ERROR, MULTIPATH_ERROR
+    return tuple(replace(p, spacing=0.0 if p.name in each else spacing) for p in processes)
+
+
 def _split_time_offset(
     parameters: dict[str, Array], constant: str, elapsed: Array
 ) -> tuple[Array | None, dict[str, Array | float]]:
@@ -245,7 +253,7 @@ class GnssPosition(_Fixes):
         return names, 2 * which[:, None] + np.array([0, 0, 1])
 
     def convert_units(self, typical: TypicalSigmas) -> Self:
-        processes = tuple(replace(p, spacing=typical.spacing) for p in self.processes)
+        processes = _space_nodes(self.processes, typical.spacing)
         return replace(self, drive_error=typical.overall(), processes=processes)
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -345,7 +353,7 @@ class GnssVelocity(_Fixes):
         )
 
     def convert_units(self, typical: TypicalSigmas) -> Self:
-        processes = tuple(replace(p, spacing=typical.spacing) for p in self.processes)
+        processes = _space_nodes(self.processes, typical.spacing)
         return replace(self, unit_error=typical.around(self.keyframe)[:, 3:], processes=processes)
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:

@@ -164,7 +164,8 @@ class _Receiver(pickle.Unpickler):
 def _work_and_exit(work: Callable[[], object], given: list[object], begin: int) -> None:
     """Work, write the result into a pipe, and end without anything that this process has registered for its end."""
     try:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # the other one says that it was interrupted
+        for what in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(what, signal.SIG_DFL)  # the other one says that it was interrupted
         with suppress(OSError):
             ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)
         with send_progress(None):

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graphnav.core.errors import ConfigError, GraphnavError
-from graphnav.core.files import read_text
+from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
+from graphnav.core.files import exists, is_inside, read_text, shorten_path
 from graphnav.core.notes import Note
 
 if TYPE_CHECKING:
@@ -118,6 +118,26 @@ def describe_place(source: str | Path, text: str, loc: tuple[str, ...]) -> str:
     return f"{source}, line {line}: " if line else f"{source}: "
 
 
+def resolve_beside(source: Path, name: str, key: str, allow_outside: bool) -> Path:
+    """The path of a file that is named under `key` in the .toml `source`.
+
+    Raises
+    ------
+    RecordingError
+        If it is no path at all, or lies outside the folder of `source`, symbolic links followed, and may not.
+    """
+    path = source.parent / name
+    if not is_inside(path, source.parent) and not allow_outside:
+        where = describe_place(source, read_text(source, RecordingError), tuple(key.split(".")))
+        raise RecordingError(
+            f"{where}'{key}' = '{shorten_path(Path(name))}' lies outside its folder; move it there, or use "
+            "--allow-outside if you trust who wrote this",
+            key="file.outside",
+        )
+    exists(path)
+    return path
+
+
 def _describe_error(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
     key = ".".join(loc)
     if first["type"] == "extra_forbidden":
@@ -151,7 +171,7 @@ def shorten(value: Any) -> str:
 
 def suggest_nearest(name: str, known: Sequence[str]) -> str:
     """The known name nearest to `name` as a question, or a list of all known names."""
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(name, known, n=1)
     if close:
         return f"did you mean '{close[0]}'?"
     return f"known: {', '.join(known[:_MAX_NAMES]) or 'none'}{', ...' * (len(known) > _MAX_NAMES)}"

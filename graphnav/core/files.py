@@ -4,7 +4,8 @@ Anything wrong with a file (a pipe or device, damaged compression, more bytes th
 the error class that the caller names. The limits are the environment variables `GRAPHNAV_MAX_FILE_MB` and
 `GRAPHNAV_MAX_LINE_KB`; SECURITY.md states their defaults.
 
-Files named inside other files are read only from the folder of the naming file or below, unless `allow_outside`.
+Files named inside other files are read only from the folder of the naming file or below, unless `allow_outside`
+(`graphnav.core.complaints.resolve_beside`).
 """
 
 from __future__ import annotations
@@ -49,31 +50,12 @@ ZIP, ARCHIVE = b"PK\3\4", "is a zip archive or a spreadsheet; unpack it, or save
 Kind = type[GraphnavError]
 
 
-def resolve_beside(source: Path, name: str, key: str, allow_outside: bool) -> Path:
-    """The path of a file that is named in `source` under `key`.
-
-    Raises
-    ------
-    RecordingError
-        If it is no path at all, or lies outside the folder of `source`, symbolic links followed, and may not.
-    """
-    path = source.parent / name
-    if not is_inside(path, source.parent) and not allow_outside:
-        raise RecordingError(
-            f"{source}: '{key}' = '{_shorten(Path(name))}' lies outside its folder; move it there, or use "
-            "--allow-outside if you trust who wrote this",
-            key="file.outside",
-        )
-    exists(path)
-    return path
-
-
 def is_inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
     """Whether a path lies in a folder or below it, symbolic links followed."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):  # too long, a null character, or a loop of links
-        raise error(f"{_shorten(path)}: is no path of a file", key="file.name") from None
+        raise error(f"{shorten_path(path)}: is no path of a file", key="file.name") from None
 
 
 def check_inside(files: Iterable[Path], source: Path) -> None:
@@ -105,7 +87,7 @@ def exists(path: Path, error: Kind = RecordingError) -> bool:
         return path.exists()
     except (OSError, ValueError) as cause:
         raise error(
-            f"{_shorten(path)}: {getattr(cause, 'strerror', None) or 'is no path of a file'}", key="file.name"
+            f"{shorten_path(path)}: {getattr(cause, 'strerror', None) or 'is no path of a file'}", key="file.name"
         ) from None
 
 
@@ -120,9 +102,9 @@ def check_regular(path: Path, error: Kind = RecordingError) -> None:
     try:
         mode = os.stat(path).st_mode
     except OSError as cause:
-        raise error(f"{_shorten(path)}: cannot be read ({cause.strerror})", key="file.unreadable") from None
+        raise error(f"{shorten_path(path)}: cannot be read ({cause.strerror})", key="file.unreadable") from None
     except ValueError:
-        raise error(f"{_shorten(path)}: is no path of a file", key="file.name") from None
+        raise error(f"{shorten_path(path)}: is no path of a file", key="file.name") from None
     if stat.S_ISDIR(mode):
         raise error(f"{path}: cannot be read (it is a folder)", key="file.folder")
     if not stat.S_ISREG(mode):
@@ -239,7 +221,8 @@ def _refuse_size(path: Path, most: int, packed: bool) -> str:
     return f"{path}: holds more than {most / 1e6:g} MB{' unpacked' if packed else ''}; if that is right, set {MAX_FILE}"
 
 
-def _shorten(path: Path) -> str:
+def shorten_path(path: Path) -> str:
+    """A path as it is quoted in a sentence, of at most 200 characters."""
     text = str(path)
     return text if len(text) <= 200 else f"{text[:100]}...{text[-40:]}"
 

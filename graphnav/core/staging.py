@@ -1,4 +1,4 @@
-"""Results are written completely or not at all, whatever stops the writing: Ctrl-C, a full disk, an error."""
+"""Results are written completely or not at all, whatever stops the writing: Ctrl-C, SIGTERM, a full disk, an error."""
 
 from __future__ import annotations
 
@@ -38,13 +38,7 @@ def stage_results(folder: Path, read: Iterable[str | Path] = ()) -> Iterator[Pat
             except PartlyWrittenError as error:
                 failed = error
             every = {file: folder / file.relative_to(part) for file in sorted(part.rglob("*")) if file.is_file()}
-            inputs = {Path(one).resolve() for one in read}
-            for target in every.values():
-                if target.resolve() in inputs:
-                    raise ConfigError(
-                        f"-o {folder}: {target} was read, and would be replaced; name another folder",
-                        key="output.is_input",
-                    )
+            keep_inputs(folder, every.values(), read)
             with defer_interrupts():
                 for file, target in every.items():
                     target.parent.mkdir(parents=True, exist_ok=True)
@@ -68,21 +62,40 @@ def stage_results(folder: Path, read: Iterable[str | Path] = ()) -> Iterator[Pat
                 path.rmdir()
 
 
+def keep_inputs(folder: Path, targets: Iterable[Path], read: Iterable[str | Path]) -> None:
+    """Refuse to write files into `folder` in place of some that are read.
+
+    Raises
+    ------
+    ConfigError
+        Naming the first.
+    """
+    inputs = {Path(one).resolve() for one in read}
+    for target in targets:
+        if target.resolve() in inputs:
+            raise ConfigError(
+                f"-o {folder}: {target} is read, and would be replaced; name another folder", key="output.is_input"
+            )
+
+
 @contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Defer Ctrl-C to the end of this context, which should be short."""
+    """Defer Ctrl-C and SIGTERM to the end of this context, which should be short."""
     # only the main thread may set handlers, and only it is interrupted
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     waiting: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: waiting.append(number))
+    before = {
+        what: signal.signal(what, lambda number, _: waiting.append(number)) for what in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-    if waiting:
-        raise KeyboardInterrupt
+        for what, handler in before.items():
+            signal.signal(what, handler)
+    for number in waiting:
+        signal.raise_signal(number)
 
 
 def _list_missing(folder: Path) -> list[Path]:

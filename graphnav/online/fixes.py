@@ -147,6 +147,16 @@ class Fixes(Buffer):
         rows = self.copy_between(begin, end)
         return self._make_gnss(rows if every else rows[rows[:, _USED] > 0.0])
 
+    def find_reflected(self, t: float) -> float:
+        """The time (s) of the last fix in use up to a time, of whose reflections those behind it may have a part; the
+        same time where fixes state no residuals.
+        """
+        if not self._states_residuals:
+            return t
+        used = self.used
+        before = used[: np.searchsorted(used, t, side="right")]
+        return float(before[-1]) if len(before) else t
+
     def _make_gnss(self, rows: Array) -> Gnss | None:
         if self._setup is None or not len(rows):
             return None

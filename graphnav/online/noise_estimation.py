@@ -96,6 +96,7 @@ class EstimationTask:
     times: Array  # (K,) s, keyframes, the first at the start of the recording: weights of rows hold at these
     unit: Array  # (3,) m, unit of the result for errors of the fixes over minutes and hours
     before: NoiseModel  # in use so far
+    last: bool  # whether its rows are as many as are wanted
 
     def run(self) -> EstimationResult:
         """As `run_estimation`."""
@@ -151,9 +152,23 @@ def run_estimation(task: EstimationTask) -> EstimationResult:
         wrong = find_fault_spans(used)
         noise = widen_unweighted(used, _convert_unit(noise, base, task.unit))
         noise = replace(noise, false_stops=unite_stops(before.false_stops, false))
+        noise = noise if task.last else _expect_variances(noise)
         return EstimationResult(noise, words, stationary, wrong, check_rows(task.every), start, points, anew)
     except np.linalg.LinAlgError as error:
         raise EstimationError(str(error), key="solver.undetermined") from error
+
+
+def _expect_variances(noise: NoiseModel) -> NoiseModel:
+    """The noise model with the means of variances in place of their most likely values, until there are enough rows.
+
+    Where variances are uncertain, the best of all linear filters is the one with their means; that of a log-normal
+    distribution of median m is m exp(s^2 / 2). Errors that last for hours stay as they are: no later row will tell.
+    """
+    figures = {
+        name: one if f".{TIMES[-1]}." in name else replace(one, log_factor=one.log_factor + 0.5 * one.sigma**2)
+        for name, one in noise.figures.items()
+    }
+    return replace(noise, figures=figures)
 
 
 def _align_again(task: EstimationTask, stationary: Array, noise: NoiseModel) -> Alignment:
@@ -242,13 +257,19 @@ def start_estimation(
     times: Array,
     until: float,
     before: NoiseModel,
+    last: bool,
 ) -> BackgroundEstimation:
-    """Start a noise estimation from the rows up to a time (s); `times` (K,) are the keyframes so far, s."""
+    """Start a noise estimation from the rows up to a time (s); `times` (K,) are the keyframes so far, s.
+
+    Parameters
+    ----------
+    last : whether none follows, so that what these rows leave open stays so, as offline.
+    """
     recording, every = (sensors.make_recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
     due = float(times[-1]) + limit_thought(settings.solver.lag)
     settings = drop_ambiguities(settings, sensors.setup)
     return BackgroundEstimation(
-        EstimationTask(recording, every, settings, frame, found, times, sensors.gnss.compute_unit(), before), due
+        EstimationTask(recording, every, settings, frame, found, times, sensors.gnss.compute_unit(), before, last), due
     )
 
 

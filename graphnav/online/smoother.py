@@ -277,9 +277,9 @@ class Smoother:
         self._begin_estimation(found, tracker)
 
     def _begin_estimation(self, found: Alignment, tracker: Tracker) -> None:
-        times = np.concatenate([self._times, tracker.window.t])
+        times, last = np.concatenate([self._times, tracker.window.t]), self._found is None
         self._estimation = start_estimation(
-            self.sensors, self.settings, tracker.frame, found, times, tracker.newest + AFTER, tracker.noise
+            self.sensors, self.settings, tracker.frame, found, times, tracker.newest + AFTER, tracker.noise, last
         )
 
     def _use(self, estimation: BackgroundEstimation, tracker: Tracker) -> None:

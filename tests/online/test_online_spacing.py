@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import oracle
 import pytest
 from test_online import joined
 
 from graphnav.config import parse_settings
+from graphnav.constraints.gnss import STAMP_ERROR, STAMPS
+from graphnav.constraints.lasting import MULTIPATH_ERROR
 from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.alignment.first import pick_fixes
+from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.unmeasured import drop_unmeasured
+from graphnav.gnss.residuals import compute_multipath_sigma
 from graphnav.online import Online, drop_rows, list_rows
+from graphnav.online.noise_estimation import CatchUp
 from graphnav.online.sensors import Sensors
 from graphnav.recording import Gnss, Imu, Recording
 
@@ -76,3 +84,36 @@ def test_a_fix_that_gives_way_to_a_better_one_leaves_no_trace() -> None:
     never = smoothed(False, sent=False)
     assert apart(smoothed(True, sent=True), never) < 1e-4  # m, of linearising elsewhere
     assert apart(smoothed(False, sent=True), never) > 1e-2
+
+
+def test_fixes_of_different_quality_have_no_error_in_common() -> None:
+    """Some are closer than usual, some behind a gap: what they share is by their residuals, and no stamp's error."""
+    recording, _ = oracle.drive(oracle.vehicle_path(130.0, 25.0), seed=3)
+    gnss, lasts = recording.crop(0.0, 100.0).gnss, 30.0
+    assert gnss is not None
+    k = np.flatnonzero((np.arange(len(gnss.t)) % 5 < 2) | (np.arange(len(gnss.t)) % 10 == 8))
+    k = k[(k < 70) | (k > 76)]
+    rms = np.random.default_rng(2).choice([0.3, 3.0, 30.0], len(k))
+    fixes = replace(pick_fixes(gnss, k), residual_rms=rms, satellites=np.full(len(k), 9.0))
+    recording = replace(recording.crop(0.0, 100.0), gnss=fixes)
+    online = Online(drop_rows(recording), parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 1000.0}}))
+    for row in list_rows(recording)[1]:
+        online.add(row)
+    names = STAMPS, *(f"gnss_position.multipath.{axis}" for axis in ("horizontal", "up"))
+    noise = NoiseModel({name: VarianceComponent(0.0) for name in names}, times={MULTIPATH_ERROR: lasts})
+    assert online.tracker is not None
+    other = CatchUp(online.tracker.restart_settled(noise, drop_rows(recording)))
+    while not other.step(online.sensors, online.tracker):
+        pass
+
+    def find_left(name: str, a: float, b: float) -> float:
+        """The share of an error at one time (s) that is left at another."""
+        places = (stage.place for stage in other.tracker.window.stages if a + 1e-6 < stage.place.t < b + 1e-6)
+        return float(np.prod([step.decay for place in places for step in place.steps if step.name == name]))
+
+    size = compute_multipath_sigma(rms, fixes.satellites)
+    for i in range(len(k) - 1):
+        a, b = fixes.t[i : i + 2]
+        expected = np.exp((a - b) / lasts) * size[i : i + 2].min() / size[i : i + 2].max()
+        assert find_left(MULTIPATH_ERROR, a, b) == pytest.approx(expected, rel=1e-9)
+        assert find_left(STAMP_ERROR, a, b) < 1e-9

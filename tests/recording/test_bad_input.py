@@ -268,7 +268,10 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
     ),
     "offset of an age": (toml('axes = "RFU"', "time_offset = 1e18"), ("key.value", "line 7", "'imu.time_offset'")),
     "curly quotes": (toml('"RFU"', "\u201cRFU\u201d"), ("toml.syntax", "line 7", "quotes")),
-    "file elsewhere": (toml('"gnss.csv"', '"/etc/gnss.csv"'), ("file.outside", "'gnss.file' = '/etc/gnss.csv'")),
+    "file elsewhere": (
+        toml('"gnss.csv"', '"/etc/gnss.csv"'),
+        ("file.outside", "line 18", "'gnss.file' = '/etc/gnss.csv'"),
+    ),
     "infinite offset": (toml('axes = "RFU"', "time_offset = inf"), ("key.value", "'imu.time_offset'")),
     # mounting
     "left-handed axes": (toml("RFU", "FRU"), ("key.value", "line 7", "'imu.axes' = 'FRU'", "FRD")),

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.core.complaints import resolve_beside
 from graphnav.core.earth import ecef_to_llh, enu_axes
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import resolve_beside
 from graphnav.core.notes import Notes, get_key
 from graphnav.core.timescales import parse_clock
 from graphnav.gnss.series import RawGnss
