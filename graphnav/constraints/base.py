@@ -204,7 +204,7 @@ class Constraint(ABC):
         """
         names = tuple(dict.fromkeys(self.noise_axes))
         index = [names.index(axis) for axis in self.noise_axes] or [-1] * len(self.axes)
-        return tuple(f"{self.name}.{name}" for name in names), np.tile(index, (len(self), 1))
+        return tuple(f"{self.name}.{name}" for name in names), np.broadcast_to(index, (len(self), len(index)))
 
     def compute_typical_error(self) -> Array:
         """Typical error of watched rows.

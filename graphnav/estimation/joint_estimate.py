@@ -166,7 +166,8 @@ def _estimate_with_worse_imu(
         median, sigma = get_prior(name)
         worse[name] = VarianceComponent(median + name.startswith("imu.") * found.excess * sigma)
     with contextlib.suppress(*BREAKDOWN):
-        return estimate_noise(stated, opening, NoiseModel(worse), found.get_linearisation(stated), progress)
+        near = found.get_linearisation(stated)
+        return estimate_noise(stated, opening, NoiseModel(worse), near, progress, known=found)
     return None
 
 

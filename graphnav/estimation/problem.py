@@ -39,6 +39,7 @@ class ParameterChain:
     parameter: Parameter
     t: Array  # (n,) s
     node: Array  # (K,) int, the node valid at each keyframe
+    steps: Array  # int, the keyframes at which the next node begins
     mean: Array  # (n, k)
     sigma: Array  # (n, k): of the first node, and of the process noise before each other node
     decay: Array  # (n,), that of the first is unused
@@ -238,23 +239,31 @@ def limit_to_samples(stationary: Array | None, recording: Recording, keyframes: 
 
 
 def _build_chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, ...]:
-    chains = []
+    chains, keyframes = [], t.tobytes()
     for p in parameters:
         if p.begins is not None:
             nodes, mean, sigma, decay = p.begins, p.initial, p.sigma, np.zeros(len(p.begins))
+            node, steps = _find_nodes(nodes, t)
         else:
-            nodes = t[:1] if p.constant else _keep_apart(t.tobytes(), p.spacing)
+            nodes, node, steps = _place_nodes(keyframes, np.inf if p.constant else p.spacing)
             ahead, added = p.step(nodes[:-1], nodes[1:])
             mean = np.tile(p.initial, (len(nodes), 1))
             sigma, decay = np.concatenate([p.sigma[None], added]), np.concatenate([[0.0], ahead])
-        node = np.maximum(np.searchsorted(nodes, t + SAME_TIME, side="right") - 1, 0)
-        chains.append(ParameterChain(p, nodes, node, mean, sigma, decay))
+        chains.append(ParameterChain(p, nodes, node, steps, mean, sigma, decay))
     return tuple(chains)
 
 
 @lru_cache(maxsize=16)  # a noise model's passes build the same chains repeatedly
-def _keep_apart(keyframes: bytes, spacing: float) -> Array:
-    return keep_apart(np.frombuffer(keyframes), spacing - SAME_TIME)
+def _place_nodes(keyframes: bytes, spacing: float) -> tuple[Array, Array, Array]:
+    t = np.frombuffer(keyframes)
+    nodes = keep_apart(t, spacing - SAME_TIME)
+    return nodes, *_find_nodes(nodes, t)
+
+
+def _find_nodes(nodes: Array, t: Array) -> tuple[Array, Array]:
+    """The node valid at each of the keyframes t (K,), and those at which the next one begins."""
+    node = np.maximum(np.searchsorted(nodes, t + SAME_TIME, side="right") - 1, 0)
+    return node, np.flatnonzero(np.diff(node)) + 1
 
 
 def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]:

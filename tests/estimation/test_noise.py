@@ -205,6 +205,25 @@ def test_estimates_end_where_the_posterior_is_level() -> None:
         assert abs(both[1] - both[0]) / (2.0 * h) * figure.sigma < 2.0, name
 
 
+def test_an_estimate_from_elsewhere_ends_where_it_comes_to_a_known_one() -> None:
+    base, opening = built(lap())
+    first = estimate_noise(base, opening)
+    far = NoiseModel({name: replace(one, log_factor=one.prior + 2.0) for name, one in first.noise.figures.items()})
+    near = first.get_linearisation(base)
+    alone, ended = (estimate_noise(base, opening, far, near, known=known) for known in (None, first))
+    assert ended.passes["filter"] < alone.passes["filter"]
+    assert ended.log_evidence <= first.log_evidence
+    for name, one in first.noise.figures.items():
+        assert abs(ended.noise.figures[name].log_factor - one.log_factor) <= one.sigma, name
+    # not at one of other figures, nor of less evidence
+    away = {name: replace(one, log_factor=one.log_factor + 9.0) for name, one in first.noise.figures.items()}
+    for known in (
+        replace(first, noise=replace(first.noise, figures=away)),
+        replace(first, log_evidence=first.log_evidence - 1e4),
+    ):
+        assert estimate_noise(base, opening, far, near, known=known).passes == alone.passes
+
+
 def mixed(base: Problem, opening: float | None) -> tuple[Problem, NoiseModel, SmootherPass]:
     """With figures that differ, so that no component is all of its noise; and points that smoothing leaves alone."""
     size = np.random.default_rng(1).normal(0.0, 0.5, len(groups(base)))

@@ -78,6 +78,12 @@ class NoiseEstimate:
         aiding = [x for name, x in figures if not name.startswith(("imu.", "prior."))]  # of offsets, no noise
         return max(((x.log_factor - x.prior) / x.prior_sigma for x in aiding), default=0.0)
 
+    def attracts(self, figures: Components, points: Points, log_evidence: float) -> bool:
+        """Whether figures with no more evidence are within a sigma of its own, and points near its own."""
+        own = self.noise.figures
+        within = all(abs(x - own[name].log_factor) <= own[name].sigma for name, x in figures.log.items())
+        return within and log_evidence <= self.log_evidence and are_near(points, self.points, LINEAR_ATTITUDE)
+
     def get_linearisation(self, base: Problem) -> tuple[Points, Problem]:
         """Its points and the problem that they are of, to start another estimate from."""
         return self.points, apply_noise(base, self.noise)
@@ -95,6 +101,7 @@ def estimate_noise(
     progress: Callable[[str, float], None] | None = None,
     intervals: bool = False,
     scales: bool = False,
+    known: NoiseEstimate | None = None,
 ) -> NoiseEstimate:
     """Estimate the noise model of a problem built with stated noise and with the parts of its intervals' noise.
 
@@ -105,6 +112,7 @@ def estimate_noise(
     near : first linearisation points, of all keyframes, and the problem that they are of.
     intervals : whether single intervals of the IMU may have more noise than the others.
     scales : whether the IMU's scale errors may be larger or smaller than stated.
+    known : an estimate by the same figures of the same measurements; where this one comes to it, it ends.
 
     Raises
     ------
@@ -113,9 +121,8 @@ def estimate_noise(
     """
     figures = begin_components(problem, start, scales)
     if near is not None:
-        return _iterate(
-            problem, figures, reuse_points(*near, apply_noise(problem, figures.build_model())), progress, intervals
-        )
+        about = reuse_points(*near, apply_noise(problem, figures.build_model()))
+        return _iterate(problem, figures, about, progress, intervals, known)
     used = apply_noise(problem, figures.build_model())
     try:
         initials, passes = find_initial_points(used, opening)
@@ -131,7 +138,8 @@ def estimate_noise(
         if start is None:
             figures.doubt_wheels(problem)
         try:
-            found.append(_iterate(problem, figures, initial.points, progress, intervals))
+            best = max(found, key=lambda one: one.log_evidence, default=None)
+            found.append(_iterate(problem, figures, initial.points, progress, intervals, best))
         except BREAKDOWN:  # from these points; others may succeed
             if initial is initials[-1] and not found:
                 raise
@@ -146,8 +154,9 @@ def _iterate(
     about: Points,
     progress: Callable[[str, float], None] | None,
     intervals: bool,
+    known: NoiseEstimate | None,
 ) -> NoiseEstimate:
-    """Iterate from initial figures and linearisation points to convergence."""
+    """Iterate from initial figures and linearisation points to convergence, or to a known estimate."""
     done, total = 0, len(problem.t)  # keyframes
     long = total > 2 * _FIRST_KEYFRAMES and not figures.known
     latest: tuple[ForwardRecord, MomentPass] | None = None
@@ -177,6 +186,7 @@ def _iterate(
             if progress is not None:
                 progress("noise", 1.0 - np.log1p(expected) / np.log1p(most_expected))
             converged = near and abs(gained) < _SETTLED * _CHANCE_GAIN * len(figures.log)
+            converged |= known is not None and end == total and known.attracts(here, ahead, evidence)
             if converged or since == _UNSETTLED:
                 break
         figures = here if converged and end == total else figures if converged else likeliest

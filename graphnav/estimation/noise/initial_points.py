@@ -24,7 +24,7 @@ from graphnav.estimation.solvers.rts import smooth_points
 BREAKDOWN = EstimationError, np.linalg.LinAlgError  # errors of a filter with a numerically singular covariance
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
 _STEPS = 20  # of Gauss and Newton in a round at most; residuals of a heading that is still wrong tell nothing
-_SETTLED = 1e-4  # sigmas by which linearisation points may be off without effect
+_SETTLED = 1e-2  # sigmas by which linearisation points may be off without effect
 _SEARCHES = 5  # searches for gross outliers at most; in most drives the second finds the same ones
 
 
@@ -121,7 +121,7 @@ def anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
         share = {c.name: 1.0 / (1.0 + (SIZES[c.unit] * wider / stated[c.name]) ** 2) for c in fixes}
         eased = weigh_rows(problem, {name: x * weights[name] for name, x in share.items()})
         if about is None:
-            about, passes = smooth_points(ekf(eased, opening=opening)), 1
+            about, passes = smooth_points(ekf(eased, opening=opening, stays=_SETTLED)), 1
         for _ in range(_STEPS):
             before, about, passes = about, smooth_points(refilter(eased, about, whole=False)), passes + 1
             if are_near(about, before):

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from scipy.special import chdtrc, chdtri, gammaln
@@ -65,12 +66,18 @@ def compute_log_normaliser(index: float | Array, m: int) -> Array:
 
 def estimate_tail_index(squared: Array, m: int) -> float:
     """The tail index, maximum a posteriori, of squared errors (N,) of m whitened numbers."""
-    index = np.exp(_GRID)
+    index, log_normaliser, log_prior = _compute_grid(m)
     over = np.maximum(squared[:, None] / (index + m), 1.0)
     cost = 0.5 * (np.minimum(squared[:, None], index + m) + (index + m) * np.log(over)).sum(axis=0)
-    value = -cost - len(squared) * compute_log_normaliser(index, m)
-    value -= 0.5 * ((_GRID - np.log(get_tail_index({}, "", m))) / _WITHIN) ** 2
-    return float(np.exp(find_peak(_GRID, value)))
+    return float(np.exp(find_peak(_GRID, log_prior - cost - len(squared) * log_normaliser)))
+
+
+@cache
+def _compute_grid(m: int) -> tuple[Array, Array, Array]:
+    """Tail indices of rows of m numbers, and the logarithms of their normaliser and prior."""
+    index = np.exp(_GRID)
+    log_prior = -0.5 * ((_GRID - np.log(get_tail_index({}, "", m))) / _WITHIN) ** 2
+    return index, compute_log_normaliser(index, m), log_prior
 
 
 def find_peak(grid: Array, value: Array) -> float:
@@ -110,6 +117,7 @@ def compute_unweighted_factor(index: float, m: int) -> float:
     return float(np.exp(np.interp(-compute_bounded_mean(m), -means, factors)))
 
 
+@cache
 def compute_bounded_mean(m: int) -> float:
     """E[min(s, q)] of a chi-square variable s of m degrees of freedom that exceeds q with a probability of `CHANCE`:
     m P(chi2_m+2 < q) + q P(chi2_m > q).

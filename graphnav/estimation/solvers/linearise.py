@@ -200,4 +200,4 @@ def find_last_keyframes(chain: ParameterChain) -> Array:
 
 def find_stepping(chain: ParameterChain, n: int | None = None) -> Array:
     """Which of the first n keyframes a parameter steps to its next node at."""
-    return np.flatnonzero(np.diff(chain.node[:n])) + 1
+    return chain.steps if n is None else chain.steps[: chain.steps.searchsorted(n)]
