@@ -36,7 +36,7 @@ from graphnav.estimation.noise.explanations import (
     add_common_errors,
     compute_evidence,
 )
-from graphnav.estimation.noise.spans import list_before, split_at_steps
+from graphnav.estimation.noise.spans import join_adjacent, list_before, move_end, split_at_steps
 from graphnav.estimation.noise.tails import compute_log_normaliser
 from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
@@ -245,6 +245,22 @@ def test_spans_and_back(built: Problem) -> None:
     assert [(f.count, f.kind) for f in found] == [(3, rows.name), (1, rows.name)]
     t = built.t[rows.keyframe]
     assert [(f.t_start, f.t_end) for f in found] == [(t[3], t[5]), (t[9], t[9])]
+
+
+def test_ends_move_from_fix_to_fix_between_their_neighbours() -> None:
+    t, spans = np.array([0.0, 1.0, 2.0, 5.0, 6.0, 7.0]), [(1.0, 2.0), (6.0, 6.0)]
+    assert move_end(spans, 0, 1, 1, t) == [(1.0, 5.0), (6.0, 6.0)]
+    assert move_end(spans, 0, 0, -1, t) == [(0.0, 2.0), (6.0, 6.0)]
+    assert move_end(spans, 0, 1, 2, t) == []  # in the other span
+    assert move_end(spans, 1, 1, 2, t) == []  # behind the last
+    assert move_end(spans, 1, 0, 1, t) == []  # behind its end
+    assert move_end([(0.0, 1.0)], 0, 0, -1, t) == []
+
+
+def test_spans_are_adjacent_where_no_fix_is_between() -> None:
+    t = np.array([0.0, 1.0, 2.0, 5.0, 6.0, 7.0])
+    assert join_adjacent([(0.0, 2.0), (5.0, 6.0)], t) == [(0.0, 6.0)]
+    assert join_adjacent([(0.0, 1.0), (5.0, 6.0), (7.0, 7.0)], t) == [(0.0, 1.0), (5.0, 7.0)]
 
 
 def test_list_before() -> None:

@@ -31,10 +31,12 @@ from graphnav.estimation.noise.apply import apply_noise, drop_parts, select_weig
 from graphnav.estimation.noise.components import begin_components
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, WHEELS
-from graphnav.estimation.noise.information import compute_information
+from graphnav.estimation.noise.information import compute_information, compute_tail_information
 from graphnav.estimation.noise.initial_points import Initial, anneal, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import (
+    Moments,
+    RowMoments,
     collect_imu_moments,
     collect_moments,
     collect_process_moments,
@@ -181,6 +183,42 @@ def test_information_is_the_derivative_of_the_squares() -> None:
         slope[j] -= A[j]
         off = np.abs(found[j] + 0.25 * slope) / np.sqrt(found[j, j] * np.diag(found))
         assert np.max(off) < 2e-3, name
+
+
+def test_weights_that_follow_take_their_part_of_the_information() -> None:
+    """Second differences of the density of rows in the tails by ln f, with the weights that go with f and with those
+    held, of rows that the trajectory does not follow."""
+    base, opening = built(lap())
+    used, _, about = mixed(base, opening)
+    one = next(c for c in used.constraints if c.name == "gnss_position")
+    rng, limit = np.random.default_rng(3), 5.0
+    u = rng.chisquare(1, (len(one), 3)) * np.where(np.arange(len(one)) % 4 == 0, 40.0, 0.5)[:, None]
+    weight = np.minimum(1.0, limit / u.sum(axis=1))
+    tails, names, (groups_of, index) = weight < 1.0, list(moments(used, about)), one.list_noise_groups()
+    assert 10 < tails.sum() < len(one) / 2
+    used = weigh_rows(used, {one.name: weight})
+    rows = {one.name: RowMoments(weight[:, None] * u, np.ones_like(u), u.sum(axis=1), np.sqrt(u))}
+    found = compute_tail_information(used, Moments(None, {}, rows), names)  # type: ignore[arg-type]
+
+    def log_density(x: Array, follow: bool) -> float:
+        s = np.sum(u * np.exp(-x[index]), axis=1)[tails]
+        return float(np.sum(-0.5 * limit * (1.0 + np.log(s / limit)) if follow else -0.5 * weight[tails] * s))
+
+    h, steps = 1e-3, np.eye(len(groups_of)) * 1e-3
+    for i, name in enumerate(groups_of):
+        for j, other in enumerate(groups_of):
+            second = [
+                sum(a * b * log_density(a * steps[i] + b * steps[j], follow) for a in (-1.0, 1.0) for b in (-1.0, 1.0))
+                for follow in (True, False)
+            ]
+            expected = (second[0] - second[1]) / (4.0 * h * h)
+            assert found[names.index(name), names.index(other)] == pytest.approx(expected, rel=1e-4, abs=1e-6), (
+                name,
+                other,
+            )
+    assert not np.delete(found, [names.index(name) for name in groups_of], axis=0).any()
+    rows = {one.name: replace(rows[one.name], A=3.0 * rows[one.name].A)}  # variances that are to grow
+    assert not compute_tail_information(used, Moments(None, {}, rows), names).any()  # type: ignore[arg-type]
 
 
 def test_estimates_end_where_the_posterior_is_level() -> None:

@@ -85,13 +85,14 @@ class Components:
                 for name in {name for groups in own for name in groups}:
                     self.log[name] += get_prior(name)[1]
 
-    def improve(self, squares: Mapping[str, Squares], information: Array) -> float:
+    def improve(self, squares: Mapping[str, Squares], information: Array, tails: Array) -> float:
         """One step of all components, and the gain in log posterior that is expected of it.
 
         Parameters
         ----------
         squares : by component.
         information : (J, J) of the measurements, in the order of the components.
+        tails : (J, J) by which it is less, as the weights of rows follow.
 
         Notes
         -----
@@ -104,6 +105,8 @@ class Components:
         slope, (pull, prior) = 0.5 * (A - B), self._differentiate_prior()
         known = np.diagonal(information)
         curved = information + prior + np.diag(np.maximum(known - slope - 0.5 * T, 0.0))
+        if np.linalg.eigvalsh(curved - tails)[0] > 0.0:
+            curved -= tails
         step = np.linalg.solve(curved, slope + pull)
         gain = 0.5 * float((slope + pull) @ step)
         step = np.where(step > 0.0, np.log1p(np.maximum(step, 0.0)), step)  # linear in the factor

@@ -28,7 +28,8 @@ from graphnav.estimation.noise.outliers import (
     compute_row_costs,
     count_reduced,
 )
-from graphnav.estimation.noise.spans import Span, drop_within, extend_to_next_fix, join, mask_times
+from graphnav.estimation.noise.spans import LeftOutErrors, Span, drop_within, extend_to_next_fix, join, mask_times
+from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 
@@ -139,3 +140,16 @@ def weigh_rest(base: Problem, found: NoiseEstimate, excluded: Mapping[str, tuple
     forward = refilter(used, found.carry_points(base, used), whole=False)
     costs = float(np.sum(compute_row_costs(used, noise.tails))) + compute_interval_cost(noise.weights, len(used.t) - 1)
     return float(np.sum(forward.log_likelihood)) + found.log_prior - costs
+
+
+def add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
+    """The estimate with weights for fixes in spans that it leaves out, so that each may be a single outlier."""
+    weights = dict(found.noise.weights)
+    for name, (t, squared, m) in errors.items():
+        weight = weigh_outlying(squared, m, get_tail_index(found.noise.tails, name, m))
+        kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
+        inside = mask_times(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
+        both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
+        order = np.argsort(both, kind="stable")
+        weights[name] = RowWeights(both[order], of_both[order])
+    return replace(found, noise=replace(found.noise, weights=weights))

@@ -28,7 +28,7 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.components import Components, Squares, begin_components
-from graphnav.estimation.noise.information import compute_information
+from graphnav.estimation.noise.information import compute_information, compute_tail_information
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import ImuMoments, Moments, collect_moments, lag_moments
@@ -285,7 +285,8 @@ def _improve(
 ) -> float:
     """One step for all figures and weights; the gain that is expected of it."""
     before = dict(figures.log)
-    gain = figures.improve(_sum_squares(problem, moments), information)
+    tails = compute_tail_information(problem, moments, tuple(figures.log))
+    gain = figures.improve(_sum_squares(problem, moments), information, tails)
     if intervals:
         _weigh_intervals(figures, problem, moments.imu)
     for chain in problem.chains:

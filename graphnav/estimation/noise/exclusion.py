@@ -35,15 +35,13 @@ than figures gain by chance.
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
 are suspected instead, the same way, and the likeliest stands, of both and of the estimate with all measurements. Where
-that leaves other spans out, so are the fixes before these.
-
-Readmission. Once the spans are left out, measurements at their ends that agree with the rest are used again, if that
-increases the evidence. Of a span that outlasts the tests, the ends are found among the fixes near them as segments are:
-single errors do not date a slow onset, and two right fixes in it contradict the error that the others have in common.
+that leaves other spans out, so are the fixes before these. Figures bent by a fault find other segments wrong than those
+estimated without it: the segments that are wrong by the figures of what stands are suspected last.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -52,10 +50,11 @@ from functools import partial
 import numpy as np
 
 from graphnav.core.beside import begin_beside
-from graphnav.estimation.faults.watch import FALSE_ALARM, PATIENCE
+from graphnav.estimation.faults.watch import FALSE_ALARM
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.decision import (
     Decision,
+    add_outliers,
     explain,
     list_explanations,
     log_evidence,
@@ -65,30 +64,26 @@ from graphnav.estimation.noise.decision import (
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.initial_points import BREAKDOWN
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.noise.moments import collect_imu_moments
 from graphnav.estimation.noise.outliers import may_pay
+from graphnav.estimation.noise.readmission import readmit
 from graphnav.estimation.noise.spans import (
-    LeftOutErrors,
     Span,
     are_covered,
-    drop_within,
     join,
     list_before,
     list_distinct,
-    mask_times,
     sum_lengths,
     trim,
 )
 from graphnav.estimation.noise.suspects import (
     cut_at_steps,
-    date_segments,
     find_segments,
     find_suspects,
     list_fix_times,
     predict_left_out,
 )
-from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem
 
 _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
@@ -129,21 +124,23 @@ def estimate_without_faults(
             passes = passes + rival.passes
     candidates = [weigh_evidence(base, replace(one, passes=Counter())) for one in (found, best)]
     passes = sum((one.passes for one in candidates), passes)
-    leading, suspected = candidates[-1], list[Span]()
-    while (before := _list_before(base, leading.noise)) and before != suspected:
-        suspected = before
-        try:
-            other = _estimate_other(base, opening, found, leading, suspected, progress)
-        except BREAKDOWN:  # from a filter that follows the wrong fixes
-            break
-        if other is None:
-            break
-        other = weigh_evidence(base, other)
-        passes = passes + other.passes
-        candidates.append(other)
-        if log_evidence(base, other) <= log_evidence(base, leading):
-            break
-        leading = other
+    leading = candidates[-1]
+    for suspect in (_suspect_before, _suspect_segments):
+        suspected = list[Span]()
+        while True:
+            before, (suspected, spent) = suspected, suspect(base, leading, candidates)
+            passes, other = passes + Counter(filter=spent), None
+            if suspected and suspected != before:
+                with contextlib.suppress(*BREAKDOWN):  # from a filter that follows the wrong fixes
+                    other = _estimate_other(base, opening, found, leading, suspected, progress)
+            if other is None:
+                break
+            other = weigh_evidence(base, other)
+            passes = passes + other.passes
+            candidates.append(other)
+            if log_evidence(base, other) <= log_evidence(base, leading):
+                break
+            leading = other
     return replace(max(candidates, key=lambda one: log_evidence(base, one)), passes=passes, rival=rival)
 
 
@@ -188,13 +185,26 @@ def _estimate_without(
         other = weigh_evidence(base, estimate_noise(base, opening, decision.noise, near, progress))
         best = max(estimate, other, key=lambda one: log_evidence(base, one))
         estimate = replace(best, passes=estimate.passes + other.passes)
-    return _readmit(base, estimate)
+    return readmit(base, estimate)
 
 
-def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
-    """Spans of fixes before those that a noise model leaves out."""
-    excluded = join(span for kind in FIXES for span in noise.excluded.get(kind, ()))
-    return list_before(excluded, list_fix_times(base)) if excluded else []
+def _suspect_before(base: Problem, leading: NoiseEstimate, _: list[NoiseEstimate]) -> tuple[list[Span], int]:
+    """Spans of fixes before those that an estimate leaves out."""
+    excluded = _list_excluded(leading)
+    return (list_before(excluded, list_fix_times(base)) if excluded else []), 0
+
+
+def _suspect_segments(base: Problem, leading: NoiseEstimate, candidates: list[NoiseEstimate]) -> tuple[list[Span], int]:
+    """Wrong segments by an estimate's figures, of those between the ends of all spans that candidates leave out, unless
+    it leaves out the same; and filter passes."""
+    spans = sorted({span for one in candidates for span in _list_excluded(one)})
+    segments, spent = find_segments(base, leading, spans)
+    return ([] if segments == _list_excluded(leading) else segments), spent
+
+
+def _list_excluded(found: NoiseEstimate | Decision) -> list[Span]:
+    """Spans of fixes that are left out."""
+    return join(span for kind in FIXES for span in found.noise.excluded.get(kind, ()))
 
 
 def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
@@ -217,8 +227,7 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
         first = replace(other, rival=first) if other.log_evidence > first.log_evidence else first
     masked = masking.get_result()
     first = replace(first, passes=passes + Counter(filter=2))
-    excluded = join(span for kind in FIXES for span in first.noise.excluded.get(kind, ()))
-    return first if are_covered(masked, excluded) else _unmask(base, found, first, masked)
+    return first if are_covered(masked, _list_excluded(first)) else _unmask(base, found, first, masked)
 
 
 def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[Span]) -> Decision:
@@ -291,28 +300,6 @@ def _use_all(base: Problem, first: Decision, estimate: NoiseEstimate, passes: Co
     return replace(first, passes=passes)
 
 
-def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
-    """Use measurements at the ends of excluded spans again that agree with the rest, if that increases the evidence."""
-    spans = join(span for some in found.noise.excluded.values() for span in some)
-    errors = predict_left_out(apply_noise(base, found.noise), found)
-    narrow, dated, passes = trim(spans, errors, FALSE_ALARM), list[Span](), found.passes
-    if any(end - begin > PATIENCE for begin, end in spans):
-        dated = date_segments(base, found, spans)
-        passes = passes + Counter(filter=1)
-    candidates = list_distinct(spans, narrow, dated)
-    if len(candidates) == 1:
-        return replace(found, passes=passes)
-    among = list_explanations(found.noise)
-    decisions = [explain(base, add_outliers(found, errors, some), some, among) for some in candidates]
-    passes = sum((one.passes for one in decisions), passes)
-    best = max(decisions, key=lambda one: one.log_evidence)
-    if best is decisions[0]:
-        return replace(found, passes=passes)
-    again = weigh_evidence(base, estimate_noise(base, None, best.noise, found.get_linearisation(base)))
-    passes = passes + again.passes
-    return replace(max(found, again, key=lambda one: log_evidence(base, one)), passes=passes)
-
-
 def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     """Estimate the noise model with more noise for single intervals of the IMU.
 
@@ -369,16 +356,3 @@ def _may_be_disturbed(base: Problem, found: NoiseEstimate) -> bool:
     points, problem = found.points, apply_noise(base, found.noise)
     imu = collect_imu_moments(problem, points.states.R_nb[:-1], points)
     return any(may_pay(imu.squared[:, i], imu.freedom[:, i]) for i in range(len(INTERVALS)))
-
-
-def add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
-    """The estimate with weights for fixes in spans that it leaves out, so that each may be a single outlier."""
-    weights = dict(found.noise.weights)
-    for name, (t, squared, m) in errors.items():
-        weight = weigh_outlying(squared, m, get_tail_index(found.noise.tails, name, m))
-        kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
-        inside = mask_times(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
-        both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
-        order = np.argsort(both, kind="stable")
-        weights[name] = RowWeights(both[order], of_both[order])
-    return replace(found, noise=replace(found.noise, weights=weights))

@@ -10,6 +10,10 @@ REML", Biometrics 51 (1995); Johnson and Thompson, J. Dairy Science 78 (1995)). 
 component j, and with u_j the innovations of a filter which these disturb and nothing else, y^T P V_i P V_j P y is the
 sum of u_i^T S^-1 u_j: one forward pass of vectors, whose gains the filter has left.
 
+With the weights of rows in the tails of their density held, that is. They follow the variances: of a row beyond the
+limit of its tails (`graphnav.estimation.noise.tails`), the weighted squares have the same sum a whatever the variances
+are, and with a_i that of component i, -d2L / dx_i dx_j has a_i a_j / 2a less.
+
 B / 2 is the information on a component that is all of the noise of its rows. One that is a small part of it has less by
 that part, and what the rows tell of one component, others may explain.
 """
@@ -66,3 +70,23 @@ def compute_information(
         of_errors, out,
     )  # fmt: skip
     return 0.5 * out
+
+
+def compute_tail_information(problem: Problem, moments: Moments, names: Sequence[str]) -> Array:
+    """By how much -d2L / dx dx (J, J) is less than with the weights of rows in the tails held.
+
+    Only of constraints whose variances are to fall: as they grow, rows come back out of the tails.
+    """
+    number, out = {name: j for j, name in enumerate(names)}, np.zeros((len(names), len(names)))
+    for rows in problem.constraints:
+        found = moments.rows.get(rows.name)
+        if found is None or rows.weight is None or np.sum(found.A) > np.sum(found.B):
+            continue
+        weight, (groups, index) = rows.weight[: len(found.A)], rows.list_noise_groups()
+        some = np.flatnonzero((weight > 0.0) & (weight < 1.0))
+        a = np.zeros((len(some), len(names)))
+        for i, group in enumerate(groups):
+            a[:, number[group]] += np.sum(found.A[some], axis=1, where=index[some] == i)
+        redundancy = np.min(found.B[some], axis=1, initial=1.0)
+        out += 0.5 * (a * (redundancy / np.maximum(np.sum(a, axis=1), 1e-30))[:, None]).T @ a
+    return out

@@ -44,6 +44,17 @@ def join(spans: Iterable[Span]) -> list[Span]:
     return out
 
 
+def join_adjacent(spans: list[Span], t: Array) -> list[Span]:
+    """Spans with those as one that have none of the times t (N,), s, between them."""
+    out: list[Span] = []
+    for begin, end in spans:
+        if out and not np.any((t > out[-1][1] + SAME_TIME) & (t < begin - SAME_TIME)):
+            out[-1] = out[-1][0], end
+        else:
+            out.append((begin, end))
+    return out
+
+
 def join_faults(faults: Iterable[ExcludedSpan]) -> list[Span]:
     """Spans of several measurements; single ones are handled by their weights."""
     return join((fault.t_start, fault.t_end) for fault in faults if fault.count > 1)
@@ -83,6 +94,20 @@ def sum_lengths(spans: Iterable[Span]) -> float:
 def are_covered(spans: Iterable[Span], by: list[Span]) -> bool:
     """Whether each span lies within one of others."""
     return all(any(a <= begin and end <= b for a, b in by) for begin, end in spans)
+
+
+def move_end(spans: list[Span], i: int, side: int, step: int, t: Array) -> list[Span]:
+    """Spans with the begin (`side` 0) or the end (1) of one at a later measurement, of those at times t (N,), s.
+
+    Empty where there is none, where it is in another span, or where none is left between begin and end.
+    """
+    at = int(np.searchsorted(t, spans[i][side] - SAME_TIME)) + step
+    if not 0 <= at < len(t):
+        return []
+    moved = [*spans]
+    moved[i] = (float(t[at]), spans[i][1]) if side == 0 else (spans[i][0], float(t[at]))
+    begins, ends = np.array(moved).T
+    return moved if np.all(begins <= ends) and np.all(begins[1:] > ends[:-1] + SAME_TIME) else []
 
 
 def list_before(spans: list[Span], t: Array) -> list[Span]:
