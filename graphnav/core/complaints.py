@@ -170,9 +170,9 @@ def shorten(value: Any) -> str:
 
 
 def suggest_nearest(name: str, known: Sequence[str]) -> str:
-    """The known name nearest to `name` as a question, or a list of all known names."""
-    close = difflib.get_close_matches(name, known, n=1)
-    if close:
+    """The known name nearest to `name`, or the only one that it begins, as a question; or a list of all known names."""
+    begun = [one for one in known if name and one.startswith(name)]
+    if close := difflib.get_close_matches(name, known, n=1) or begun[: len(begun) == 1]:
         return f"did you mean '{close[0]}'?"
     return f"known: {', '.join(known[:_MAX_NAMES]) or 'none'}{', ...' * (len(known) > _MAX_NAMES)}"
 
