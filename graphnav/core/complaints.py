@@ -171,9 +171,10 @@ def shorten(value: Any) -> str:
 
 def suggest_nearest(name: str, known: Sequence[str]) -> str:
     """The known name nearest to `name`, or the only one that it begins, as a question; or a list of all known names."""
-    begun = [one for one in known if name and one.startswith(name)]
-    if close := difflib.get_close_matches(name, known, n=1) or begun[: len(begun) == 1]:
-        return f"did you mean '{close[0]}'?"
+    close = difflib.get_close_matches(name, known, n=1)
+    longer = [one for one in known if name and one.startswith(name)]
+    if close or len(longer) == 1:
+        return f"did you mean '{(close or longer)[0]}'?"
     return f"known: {', '.join(known[:_MAX_NAMES]) or 'none'}{', ...' * (len(known) > _MAX_NAMES)}"
 
 

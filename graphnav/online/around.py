@@ -20,7 +20,7 @@ def cut_around(sensors: Sensors, begin: float, end: float) -> Recording:
     A gap of the IMU is filled by all of its rows that are kept: half a minute may have no turn like the one it is in.
     """
     near = sensors.make_recording(begin - ROWS_BEFORE, end)
-    near = replace(near, gnss=sensors.gnss.select_as_gnss(sensors.gnss.find_reflected(begin - ROWS_BEFORE), end))
+    near = replace(near, gnss=sensors.gnss.select_as_gnss(sensors.gnss.find_fix_before(begin - ROWS_BEFORE), end))
     t = near.imu.t
     whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < find_gap_limit(t)
     if whole:

@@ -147,7 +147,7 @@ class Fixes(Buffer):
         rows = self.copy_between(begin, end)
         return self._make_gnss(rows if every else rows[rows[:, _USED] > 0.0])
 
-    def find_reflected(self, t: float) -> float:
+    def find_fix_before(self, t: float) -> float:
         """The time (s) of the last fix in use up to a time, of whose reflections those behind it may have a part; the
         same time where fixes state no residuals.
         """

@@ -190,19 +190,19 @@ def _estimate_without(
 
 def _suspect_before(base: Problem, leading: NoiseEstimate, _: list[NoiseEstimate]) -> tuple[list[Span], int]:
     """Spans of fixes before those that an estimate leaves out."""
-    excluded = _list_excluded(leading)
+    excluded = _list_spans(leading)
     return (list_before(excluded, list_fix_times(base)) if excluded else []), 0
 
 
 def _suspect_segments(base: Problem, leading: NoiseEstimate, candidates: list[NoiseEstimate]) -> tuple[list[Span], int]:
     """Wrong segments by an estimate's figures, of those between the ends of all spans that candidates leave out, unless
     it leaves out the same; and filter passes."""
-    spans = sorted({span for one in candidates for span in _list_excluded(one)})
+    spans = sorted({span for one in candidates for span in _list_spans(one)})
     segments, spent = find_segments(base, leading, spans)
-    return ([] if segments == _list_excluded(leading) else segments), spent
+    return ([] if segments == _list_spans(leading) else segments), spent
 
 
-def _list_excluded(found: NoiseEstimate | Decision) -> list[Span]:
+def _list_spans(found: NoiseEstimate | Decision) -> list[Span]:
     """Spans of fixes that are left out."""
     return join(span for kind in FIXES for span in found.noise.excluded.get(kind, ()))
 
@@ -227,7 +227,7 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
         first = replace(other, rival=first) if other.log_evidence > first.log_evidence else first
     masked = masking.get_result()
     first = replace(first, passes=passes + Counter(filter=2))
-    return first if are_covered(masked, _list_excluded(first)) else _unmask(base, found, first, masked)
+    return first if are_covered(masked, _list_spans(first)) else _unmask(base, found, first, masked)
 
 
 def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[Span]) -> Decision:

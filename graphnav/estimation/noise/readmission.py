@@ -69,10 +69,14 @@ def _move_ends(decide: Callable[[list[Span]], Decision], spans: list[Span], best
     """The likeliest decision, from one on spans, by moving the ends of those that outlast the tests along the fixes at
     times t (N,), s: inwards, and else outwards."""
     for i in (i for i, (begin, end) in enumerate(spans) if end - begin > PATIENCE):
-        for side, step in ((0, 1), (0, -1), (1, -1), (1, 1)):
-            while moved := move_end(spans, i, side, step, t):
-                other = decide(moved)
-                if other.log_evidence <= best.log_evidence:
+        for side, inwards in ((0, 1), (1, -1)):
+            for step in (inwards, -inwards):
+                before = best
+                while moved := move_end(spans, i, side, step, t):
+                    other = decide(moved)
+                    if other.log_evidence <= best.log_evidence:
+                        break
+                    spans, best = moved, other
+                if best is not before:
                     break
-                spans, best = moved, other
     return best
