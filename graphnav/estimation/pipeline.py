@@ -270,7 +270,7 @@ def _solve(
         *undone,
         *shown,
         *found.detections.notes,
-        *describe_stamps(stamps),
+        *describe_stamps(stamps, found.noise.freed),
         *found.notes,
         *describe_unmeasured(found.unmeasured, recording),
         *describe_faults(faults, problem),

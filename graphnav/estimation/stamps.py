@@ -30,6 +30,7 @@ from graphnav.core.interpolation import pick_nearest
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import shift_stamps, shift_stamps_back
+from graphnav.estimation.contradictions import Freed
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
 from graphnav.estimation.noise.spans import Span
@@ -46,6 +47,7 @@ _OWN_STAMPS = GnssPosition.name, GnssVelocity.name
 _SIGNIFICANT = 3.0  # sigmas
 _MOVES = 3  # of moving the stamps
 _A_PPM = 1e-6
+_FASTEST = 6e-3  # s/s between two clocks: a ceramic resonator (5e-3) beside a crystal, and what an estimate is off
 
 # a recording whose stamps are moved, by which rate (s/s), and what was begun with others, if anything -> its beginning
 Begin = Callable[[Recording, float, Begun | None], Begun]
@@ -255,8 +257,13 @@ def shift_to_own_clocks(solution: Solution, offsets: StampOffsets) -> Solution:
     )
 
 
-def describe_stamps(offsets: StampOffsets) -> tuple[str, ...]:
-    """A note on stamps that were moved."""
+def describe_stamps(offsets: StampOffsets, freed: Freed) -> tuple[str, ...]:
+    """Notes on stamps that were moved, and on clocks that drift apart as none do.
+
+    Parameters
+    ----------
+    freed : as of a noise model, with the rate that is left.
+    """
     if offsets == AS_STATED:
         return ()
     by = f"{offsets.positions:+.2f} s"
@@ -268,7 +275,15 @@ def describe_stamps(offsets: StampOffsets) -> tuple[str, ...]:
     elif offsets.odometer:  # it agrees with the fixes
         mend = f": add {-offsets.positions:+.2f} to time_offset in [imu]"
     sentence = f"stamps of the fixes moved by {by}, at which they agree with the IMU{mend}"
-    return (Note("gnss.stamps_moved", sentence),)
+    moved = Note("gnss.stamps_moved", sentence)
+    rate = offsets.rate + (freed[CLOCK_RATE].value[0] if CLOCK_RATE in freed else 0.0)
+    if abs(rate) <= _FASTEST:
+        return (moved,)
+    words = (
+        f"no clocks drift apart by {abs(rate) / _A_PPM:.0f} ppm, as those of IMU and fixes do here; one of them may "
+        "have been set while it recorded: use what lies before or after (--start, --end)"
+    )
+    return moved, Note("doubt.clocks", f"The stamps cannot be trusted: {words}")
 
 
 def _list_by_constraint(offsets: StampOffsets) -> dict[str, float]:

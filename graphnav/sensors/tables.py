@@ -44,10 +44,10 @@ def check_three_numbers(value: Any) -> Any:
 
 Vector = Annotated[tuple[float, float, float], BeforeValidator(check_three_numbers)]
 
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86400.0}
 ANGLE = {"deg": np.pi / 180.0, "rad": 1.0}
 
-TimeUnit = Literal["s", "ms", "us", "ns"]
+TimeUnit = Literal["s", "ms", "us", "ns", "d"]
 
 
 class TomlTable(BaseModel):

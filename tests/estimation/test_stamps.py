@@ -98,6 +98,15 @@ def test_clocks_that_drift_apart_lead_to_the_same_path(case: str) -> None:
     assert (solved(case).noise.stamps.rate != 0.0) == (case == "resonator")
 
 
+def test_a_clock_that_was_set_meanwhile_is_no_drift() -> None:
+    recording = drive()
+    gnss = recording.gnss
+    assert gnss is not None
+    later = replace(recording, gnss=replace(gnss, t=gnss.t + (gnss.t > recording.start + 0.3 * END))).crop(0.0, END)
+    assert "doubt.clocks" in map(get_key, run(later, solvers=("ekf",))["ekf"].notes)
+    assert "doubt.clocks" not in map(get_key, solved("resonator").notes)
+
+
 def test_an_offset_is_no_smaller_for_vibration(shared_data: Path) -> None:
     """On boulder, where the force of single samples is noisy and the velocities are good to 5 cm/s. With the force of a
     tenth of a second for the acceleration, an offset of velocities is estimated a sixth too small.

@@ -134,6 +134,7 @@ def shift_decimal(k: int, factor: float) -> Callable[[list[float]], list[float]]
 
 IMU_HEADER = "t,gx,gy,gz,ax,ay,az"
 GOOD_ROW = "0.01,0,0,0,0,0,9.8"
+IN_DAYS = "\n".join([IMU_HEADER, *(f"45966.000000{k},0,0,0,0,0,9.8" for k in range(1, 10))]).encode()  # 0.0864 s apart
 
 # what is broken: (how, the key of the error and the names that its line must hold)
 BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
@@ -201,6 +202,7 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
     ),
     "time in ms": (every("imu.csv", shift_decimal(0, 1e3)), ("imu.time_unit", "imu.csv", 't = "ms"')),
     "time in us": (every("imu.csv", shift_decimal(0, 1e6)), ("imu.time_unit", "imu.csv", 't = "us"')),
+    "time in days": (content("imu.csv", IN_DAYS), ("imu.time_unit", "imu.csv", 't = "d"')),
     # positions
     "lat and lon swapped": (
         both(line("gnss.csv", 1, "t,lon,lat,h,sd_e,sd_n,sd_u")),
@@ -356,6 +358,7 @@ MENDED: dict[str, tuple[Break, tuple[str, ...], int]] = {
         ("imu.rows_unordered", "1", "0.030"),
         100,
     ),
+    "stamp in ms": (line("imu.csv", 50, "490,0,0,0,0,0,9.8"), ("imu.rows_stray", "1 IMU row", "490.000"), 99),
     "repeated": (line("imu.csv", 4, "0.02,5,5,5,5,5,5"), ("imu.rows_repeated", "1", "0.020"), 99),
     "NaN row": (line("imu.csv", 4, "0.03,0,nan,0,0,0,9.8"), ("imu.rows_blank", "1", "0.030"), 99),
     "blank cell": (line("imu.csv", 4, "0.03,0,,0,0,0,9.8"), ("imu.rows_blank", "1", "0.030"), 99),

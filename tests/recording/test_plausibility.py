@@ -573,6 +573,14 @@ def test_a_clock_that_is_set_back_is_refused(tmp_path: Path, tokyo: Recording) -
     write(t - 18.0 * (t > t[3000]), v)
     with refused("table.clock_back", RecordingError, "o.csv", "18.0"):
         read(tmp_path)
+    # twenty rows, of 0.4 s
+    write(t - (t[20] - t[0]) * (t > t[3000]), v)
+    with refused("table.clock_back", RecordingError, "o.csv"):
+        read(tmp_path)
+    # the same rows sent again are dropped
+    order = np.r_[0:3000, 2960 : len(t)]
+    write(t[order], v[order])
+    assert len(read(tmp_path).odometer.t) == len(t)
     # a block that was written late is sorted: no time is there twice
     order = np.r_[0:2000, 2500:3000, 2000:2500, 3000 : len(t)]
     write(t[order], v[order])

@@ -85,6 +85,8 @@ def test_units_become_si(tmp_path: Path) -> None:
     assert np.allclose(imu.t, [0.001, 0.002])
     assert np.allclose(imu.gyro[0], np.radians([1, 2, 3]))
     assert np.allclose(imu.accel[0], np.array([4, 5, 6]) * 9.80665)
+    days = read(describe(tmp_path, 'units = { t = "d" }', rows=IMU_ROWS.replace("0.0", "45966.000000"))).imu
+    assert np.diff(days.t) == pytest.approx(0.00864, abs=1e-6)  # what numbers of 64 bits resolve
 
 
 @pytest.mark.parametrize(("unit", "mps"), [("m/s", 36.0), ("km/h", 10.0), ("mph", 16.09344), ("knots", 18.52)])

@@ -36,7 +36,7 @@ class Guess:
 
 
 def guess_time_unit(t: Array, stated: str | None, imu: bool) -> Guess:
-    """s, ms, us or ns: by the name, by the magnitude of an epoch, by the step."""
+    """s, ms, us, ns or d: by the name, by the magnitude of an epoch, by the step."""
     step = _compute_step(t)
     if stated is not None and step * TIME_UNITS[stated] < _LARGEST_STEP:
         return Guess(stated, "as the column's name says")

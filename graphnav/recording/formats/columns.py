@@ -104,6 +104,7 @@ ATTITUDE = tuple(_ATTITUDE_PATTERNS)
 
 NAMED_UNITS = {
     "s": ("t", "s"), "sec": ("t", "s"), "seconds": ("t", "s"), "ms": ("t", "ms"), "us": ("t", "us"), "ns": ("t", "ns"),
+    "days": ("t", "d"),
     "dps": ("gyro", "deg/s"), "deg_s": ("gyro", "deg/s"), "degps": ("gyro", "deg/s"), "deg_sec": ("gyro", "deg/s"),
     "rad_s": ("gyro", "rad/s"), "rps": ("gyro", "rad/s"), "rads": ("gyro", "rad/s"), "mdps": ("gyro", "mdeg/s"),
     "rad_sec": ("gyro", "rad/s"), "radps": ("gyro", "rad/s"),
