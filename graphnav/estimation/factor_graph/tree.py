@@ -223,13 +223,14 @@ class Tree:
         self, made: Sequence[Made], gone: Sequence[int], first: int, fresh: Sequence[Variable] = (), known: Any = ()
     ) -> None:
         """Have factors in place of others, on keyframes from number `first` on."""
-        # elimination order is that of time; with much to do, GTSAM rebuilds the whole tree
+        # elimination order is that of time, in which those in force are the newest, though nothing new may touch them:
+        # else what leaves would stand above them. With much to do, GTSAM rebuilds the whole tree
         late = [v for v in self.variables.values() if v.last >= first]
-        every = 2 * len(late) > len(self.variables) and not fresh
-        if every:
+        if 2 * len(late) > len(self.variables) and not fresh:
             late, first = list(self.variables.values()), self.keyframes[0].number
-        order = [(v, v.last - first) for v in late]
-        update_isam(self.isam, self.keyframes[-1].t, made, gone, fresh, known, order, late if every else None)
+        order, new = [(v, v.last - first) for v in late], {v.key for v in fresh}
+        again = [v for v in late if v.key not in new]
+        update_isam(self.isam, self.keyframes[-1].t, made, gone, fresh, known, order, again)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:

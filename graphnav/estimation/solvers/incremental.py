@@ -27,7 +27,7 @@ _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 # a look at what has moved of a whole drive costs as much as there are keyframes: the next one follows when there are a
 # part in this many more, and at least so many
 _GROWN, _LEAST = 8, 10
-_SHORT = 3  # portions of a window over which covariances are smoothed all at once
+_SHORT = 2  # portions of a window over which covariances are smoothed all at once
 _MAX_INTEGRATIONS = 5  # computing: rounds of integrating about the present biases and relinearising
 # shares of the usual limits within which keyframes have converged that settle, as they are not linearised again
 _SETTLING, _FINE = 0.25, 0.02  # and all that remain at the end
