@@ -297,14 +297,20 @@ def test_keyframes_come_again_after_others_were_taken_back(drive: Drive) -> None
 
 
 def test_a_tree_made_again_from_its_rows_goes_on_as_before(built: Problem) -> None:
-    """What a checkpoint keeps of it, in the middle of a lag, with keyframes already marginalised."""
+    """What a checkpoint keeps in the middle of a lag: keyframes have been marginalised, and others are to leave."""
     import pickle
 
     window = play(built, 60)
     window.settle(40)
+    assert not window.smooth_back(5, 10)
+    assert not window.smooth_back(5, 10)
+    fill(window, built, 60, 62, every=1000)
     again = pickle.loads(pickle.dumps(window))
+    a, b = (one.settle(5) for one in (window, again))
+    np.testing.assert_array_equal(a.states.p, b.states.p)
+    np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-6, atol=1e-14)
     for one in (window, again):
-        fill(one, built, 60, 80, every=2)
+        fill(one, built, 62, 80, every=2)
     a, b = (one.settle(len(one)) for one in (window, again))
     np.testing.assert_allclose(a.states.p, b.states.p, atol=1e-6)
     np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-4, atol=1e-14)

@@ -7,6 +7,8 @@ found by eliminating the tree's factors from the other end, the newest first, wh
 
 from __future__ import annotations
 
+from typing import Any
+
 import gtsam
 import numpy as np
 
@@ -117,6 +119,14 @@ class Elimination:
         else:
             return True
         return False
+
+    def __getstate__(self) -> dict[str, Any]:
+        """With all done, for which the graph is no longer needed."""
+        done = object.__new__(Elimination)
+        done.__dict__.update(self.__dict__, _behind=list(self._behind))
+        while not done.step():
+            pass
+        return {**done.__dict__, "_graph": None}
 
     def settle(self) -> SettledStates:
         """States, parameters and covariances, all at once of what is left to be done."""

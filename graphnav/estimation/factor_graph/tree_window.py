@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -108,10 +107,6 @@ class TreeWindow(Window):
         if count == len(self.stages):
             self.tree.release()
         return leaving
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but what has been done for stages that are to leave, which is made again."""
-        return {**self.__dict__, "_leaving": None}
 
     def _relinearise_keyframes(self, count: int) -> None:
         self.relinearized += count
