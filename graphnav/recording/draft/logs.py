@@ -30,8 +30,9 @@ from graphnav.recording.formats import columns as matching
 from graphnav.recording.formats.folder import read_other_log
 from graphnav.recording.formats.places import check_angles, find_places
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.repair import blank_unknown, find_repeated, mask_new_fixes
+from graphnav.recording.formats.repair import blank_unknown, mask_new_fixes
 from graphnav.recording.formats.schema import WHEELS
+from graphnav.recording.formats.stamps import find_repeated
 from graphnav.recording.formats.table import Table, read_column_names, read_first_rows, read_table
 from graphnav.sensors.tables import ANGLE, TIME_UNITS
 

@@ -7,7 +7,7 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Notes
 from graphnav.core.rotation import Array
-from graphnav.recording.formats.repair import format_row_count
+from graphnav.recording.formats.stamps import format_row_count
 from graphnav.recording.formats.table import Selection, Table
 
 _HIGHEST = 9000.0  # m, highest drive on Earth

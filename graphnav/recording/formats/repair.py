@@ -12,18 +12,23 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import UNIX, find_restarts
 from graphnav.recording import FIX_TYPES, convert_fix_types
+from graphnav.recording.formats.stamps import (
+    check_days,
+    check_fix_clock,
+    check_imu_steps,
+    check_passes,
+    find_lone_stamps,
+    find_repeated,
+    format_row_count,
+    take_halfway,
+    tell_rounding,
+)
 from graphnav.recording.formats.table import Selection, Table
 from graphnav.sensors.tables import LATEST, TIME_UNITS, Keep
 
 _SENSOR_LABELS = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
 VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a larger sigma carries no information
 _LEAST_SIGMA = 1e-9  # m, m/s; a smaller sigma is not meant as one
-_SET_BACK_PERIODS = 10.0  # periods; rows that overtake each other are closer
-_PAUSE = 1.0  # s; longer steps of an IMU are gaps
-_BURST = 0.3  # ratio of median to mean step below which rows come in bursts
-_ROUNDED_AWAY = 0.05  # share of the stamps that repeat the one before, where a rounding makes them
-_REPEATED = 0.6  # share of rows with the stamp of the previous row above which the log is refused
-
 
 # 1-sigma where a recording states none, from the GPS Standard Positioning Service Performance Standard (5th ed.,
 # 2020, section 3.8): 8 m horizontal (2.45 sigma in two dimensions) and 13 m vertical (1.96 sigma), both 95 %.
@@ -91,6 +96,15 @@ def select_usable_rows(
         remarks.add(f"{sensor}.rows_blank", f"{format_row_count(blank, label)} with {what} values dropped{at}")
         rows = rows.take(~blank)
 
+    check_days(rows, unit)
+    if (lone := find_lone_stamps(rows["t"])).any():
+        k = int(np.flatnonzero(lone)[0])
+        remarks.add(
+            f"{sensor}.stamps_lone",
+            f"{format_row_count(lone, label)} with a stamp far from those around it (first {rows['t'][k]:.10g} s, "
+            f"after t = {rows['t'][k - 1]:.3f} s) taken to be halfway between them",
+        )
+        rows = rows.with_column("t", np.where(lone, take_halfway(rows["t"]), rows["t"]))
     scale = TIME_UNITS[unit]
     if (later := find_restarts((rows["t"] - offset) / scale, scale)) is not None:
         remarks.add(
@@ -99,10 +113,12 @@ def select_usable_rows(
         )
         rows = rows.with_column("t", rows["t"] + later * scale)
     t = rows["t"]
+    if "lat" in rows and "lon" in rows:
+        check_fix_clock(rows, label)
     step = np.diff(t)
     if (step < 0).any():
         first = np.flatnonzero(step < 0)[0]
-        _check_passes(rows, label)
+        check_passes(rows, label)
         remarks.add(
             f"{sensor}.rows_unordered",
             f"{label} rows out of order sorted by time ({format_count((step < 0).sum(), 'step')} back, "
@@ -115,43 +131,16 @@ def select_usable_rows(
         remarks.add(
             f"{sensor}.rows_repeated",
             f"{format_row_count(repeated, label)} with the time of the row before dropped "
-            f"(first at t = {t[repeated][0]:.3f} s){_tell_rounding(stamps, repeated)}",
+            f"(first at t = {t[repeated][0]:.3f} s){tell_rounding(stamps, repeated)}",
         )
         rows = rows.take(~repeated)
     if sensor == "imu":
-        _check_imu_time(rows, unit)
+        check_imu_steps(rows, unit)
     if sensor == "gnss" and not (new := mask_new_fixes(rows.columns)).all():
         rows = rows.take(new)
         held = format_row_count(~new, "GNSS")
         remarks.add("gnss.held", f"{held} with the fix of the row before left out, {len(rows)} kept")
     return rows
-
-
-def _tell_rounding(stamps: Array, repeated: NDArray[np.bool_]) -> str:
-    """'; ...' where stamps (N,), in the file's unit, repeat because they went through single precision."""
-    known = stamps[np.isfinite(stamps)]
-    step = np.spacing(np.float32(np.abs(known).max())) if len(known) else 0.0
-    if repeated.mean() < _ROUNDED_AWAY or not np.array_equal(known, known.astype(np.float32)):
-        return ""
-    return f": stamps are rounded to {step:g}, as single-precision numbers are; write them with double precision"
-
-
-def find_repeated(where: str, t: Array) -> NDArray[np.bool_]:
-    """(N,) mask of stamps, in order, that equal the previous one; `where` they are, in words.
-
-    Raises
-    ------
-    RecordingError
-        If most are.
-    """
-    repeated = np.r_[False, np.diff(t) == 0]
-    if repeated.mean() > _REPEATED:
-        raise RecordingError(
-            f"{where}: {format_row_count(repeated, '')} of {len(t)} with the time of the row before: the fraction of "
-            "the seconds was lost, or several rows are stamped at once; log the time of each, with milliseconds",
-            key="table.times_repeated",
-        )
-    return repeated
 
 
 def mask_new_fixes(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
@@ -167,57 +156,6 @@ def mask_new_fixes(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
     changes = np.flatnonzero(~same) + 1
     held = len(changes) > 2 and float(np.median(np.diff(changes))) >= 2.0
     return np.r_[True, ~same] if held else np.ones(len(columns["t"]), dtype=bool)
-
-
-def _check_passes(rows: Table, label: str) -> None:
-    """Refuse a clock that was set back: the stamps before and after it are then interleaved."""
-    t = rows["t"]
-    period = float(np.median(np.abs(np.diff(t))))
-    back = np.flatnonzero(np.diff(t) < -_SET_BACK_PERIODS * period)
-    for k in back[:20]:
-        again, before = float(t[k + 1]), t[: k + 1]
-        before = before[before >= again]
-        after = t[k + 1 :][t[k + 1 :] <= t[k]]
-        # rows that were only written late fill the gap that they left
-        shared = min(before.max(), after.max()) - max(before.min(), after.min())
-        if shared > 0.5 * (t[k] - again) and shared > _SET_BACK_PERIODS * period:
-            jump = float(t[k] - again + period)
-            leap = " (GPS time and UTC are 18 s apart)" if abs(jump - 18.0) < 0.5 else ""
-            raise RecordingError(
-                f"{rows.path}: the clock of the {label} is set back by {jump:.2f} s after t = {t[k]:.3f} s{leap}: what "
-                "lies between is there twice; write all stamps on one clock",
-                key="table.clock_back",
-            )
-
-
-def format_row_count(mask: Selection, label: str) -> str:
-    """The number of rows in a mask (N,), with the sensor's label."""
-    return format_count(mask.sum(), f"{label} row".strip())
-
-
-def _check_imu_time(rows: Table, unit: str) -> None:
-    if len(rows) < 2:
-        raise RecordingError(
-            f"{rows.path}: {len(rows)} usable row; an IMU recording needs at least 2", key="table.few_rows"
-        )
-    every = np.diff(rows["t"])
-    step = float(np.median(every))
-    usual = float(np.mean(every[every < _PAUSE])) if (every < _PAUSE).any() else step
-    if step < _BURST * usual:
-        raise RecordingError(
-            f"{rows.path}: most IMU rows are {step:.2g} s apart, but {usual:.2g} s in the mean: they come in "
-            "bursts, with the times of their arrival; write the times at which they were measured",
-            key="imu.bursts",
-        )
-    if 1e-5 < step < 0.5:
-        return
-    fitting = [u for u in TIME_UNITS if 2.5e-4 <= step / TIME_UNITS[unit] * TIME_UNITS[u] <= 0.1 and u != unit]
-    hint = f'; if t is in {fitting[0]}, set units = {{ t = "{fitting[0]}" }}' if fitting else ""
-    if step == 1.0:
-        hint += "; if it counts rows, write times instead"
-    raise RecordingError(
-        f"{rows.path}: IMU rows are {step:g} s apart, which no usable IMU is{hint}", key="imu.time_unit"
-    )
 
 
 def choose_sigmas(
