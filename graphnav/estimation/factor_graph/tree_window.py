@@ -30,6 +30,7 @@ from graphnav.estimation.solvers.stages import Message, Place, Stage
 from graphnav.estimation.solvers.window import Window
 
 _MAX_STEPS = 5
+_LATER = 0.4  # of the usual limits, within which keyframes may wait until they settle
 _CONVERGED_SHARE = 0.02  # of the usual limits, within which the last window is converged
 
 
@@ -67,6 +68,11 @@ class TreeWindow(Window):
         """As of `Window`."""
         self.tree.read()
         return read_states(self.tree.keyframes[self.tree.held :])
+
+    def needs_revision(self, share: float, count: int) -> bool:
+        """As of `Window`; those that do not settle yet may have moved further: all since would be eliminated anew."""
+        moves = self._find_moves()
+        return bool(np.any(moves[:count] > share) or np.any(moves > max(share, _LATER)))
 
     def _find_moves(self) -> Array:
         if self.stages:

@@ -64,25 +64,28 @@ class Incremental:
             self.look = len(window) + max(_LEAST, len(window) // _GROWN)
         count = window.leaving
         if not count and are_due(window.stages[0].place.t, place.t, self.lag):
-            self._converge(_SETTLING, any(c.robust != "none" for c in self.problem.constraints))
             count = int(np.searchsorted(window.t, place.t - self.lag))
+            self._converge(count, _SETTLING, any(c.robust != "none" for c in self.problem.constraints))
         if count and (window.smooth_back(count, window.smoothed) or len(window) <= _SHORT * window.smoothed):
             self.settled.append(window.settle(count))
 
     def finish(self) -> None:
         """End of input: settle all."""
         if len(self.window):
-            self._converge(_FINE, always=True)
+            self._converge(len(self.window), _FINE, always=True)
             self.settled.append(self.window.settle(len(self.window)))
 
-    def _converge(self, share: float = 1.0, always: bool = False) -> None:
-        """Relinearise until nothing has moved, about intervals integrated at the present biases."""
+    def _converge(self, count: int, share: float, always: bool = False) -> None:
+        """Relinearise until nothing has moved, about intervals integrated at the present biases, for the first stages
+        to settle.
+        """
         window, newest = self.window, self.window.newest
         for _ in range(_MAX_INTEGRATIONS):
             states, scale = window.read_states(), scale_at(newest.columns, newest.values)
-            self.problem, count = integrate_again(self.problem, states, scale, window.stages[0].place.k)
-            window.converge(share, always or count > 0, self._renew)
-            if not count:
+            self.problem, again = integrate_again(self.problem, states, scale, window.stages[0].place.k)
+            if always or again > 0 or window.needs_revision(share, count):
+                window.converge(share, always or again > 0, self._renew)
+            if not again:
                 return
 
     def _renew(self, first: int, end: int) -> list[Place]:

@@ -284,6 +284,10 @@ class Window:
         moves = self._find_moves()
         return int(np.argmax(moves > almost * share)) if np.any(moves > share) else None
 
+    def needs_revision(self, share: float, count: int) -> bool:
+        """Whether `revise`, with that share of the limits, is to do anything before the first `count` stages settle."""
+        return self.find_first_moved(share) is not None
+
     def _find_moves(self) -> Array:
         """(n,) how far the smoothed states are from their points, 1 at the limit."""
         means, limit = self.compute_means()[1:], self._limit[1]
