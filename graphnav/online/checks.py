@@ -6,15 +6,18 @@ The checks are those of a recording before it is solved (`graphnav.recording.che
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 
-from graphnav.core.findings import Finding
+from graphnav.core.findings import SEVERITIES, Finding
 from graphnav.core.notes import Note, format_count
-from graphnav.online.neighbours import FilledRows
+from graphnav.online.sensors import Sensors
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import inspect
+from graphnav.recording.formats.stamps import describe_set_back
 from graphnav.recording.plausibility.filled import describe_filled
 
+_OF_STREAM = ("imu.filled", "gnss.clock_back")  # keys of what only the order of rows tells
 _FEWEST_IMU_ROWS = 50  # rows of the IMU, at least
 _MOST_LEFT_OUT = 0.5  # share of a sensor's rows; above it they are not single outliers
 # causes of rejected rows, and what makes all rows of a sensor so
@@ -42,12 +45,17 @@ def check_rows(recording: Recording) -> tuple[Finding, ...]:
     return tuple(replace(f, sentence=f"{until}: {f.sentence}{keys}") for f in findings if f.severity != "note")
 
 
-def check_filled(filled: FilledRows) -> tuple[Finding, ...]:
-    """The finding on rows of the IMU that no sensor measured, if there are any."""
-    if not filled.count:
-        return ()
-    span, at = filled.longest
-    return (describe_filled(filled.count, filled.stretches, span, f"{at:.1f} s"),)
+def add_stream(found: Iterable[Finding], sensors: Sensors) -> tuple[Finding, ...]:
+    """Findings and those that only the order of rows tells, the most severe first: rows of the IMU that no sensor
+    measured, and a clock of fixes that was set back.
+    """
+    out, filled, back = [f for f in found if f.key not in _OF_STREAM], sensors.filled, sensors.gnss.arrivals.set_back
+    if back is not None:
+        out.append(Finding("refused", f"the {describe_set_back('GNSS', *back)}", "gnss.clock_back"))
+    if filled.count:
+        span, at = filled.longest
+        out.append(describe_filled(filled.count, filled.stretches, span, f"{at:.1f} s"))
+    return tuple(sorted(out, key=lambda one: SEVERITIES.index(one.severity)))
 
 
 def check_counts(counts: Counter[str]) -> tuple[Note, ...]:

@@ -14,12 +14,33 @@ from graphnav.estimation.noise.spacing import find_grid_start, select_best_fixes
 from graphnav.estimation.noise.unmeasured import mark_copies
 from graphnav.online.buffers import SAME, Buffer
 from graphnav.recording import Gnss
+from graphnav.recording.formats.stamps import RUN, find_set_back
 
 _WIDTH = 21  # after a fix's values six typical sigmas, whether it is used, rms of its residuals and satellites
 _USED, _RESIDUALS = 19, 20
 _VOID = -1.0  # no measurement: a copy of the fix before, or filled in
 _NEAR = 8  # rows either side of a new one among which copies are sought
 _AVERAGED_OVER = 60.0  # s over which the typical sigma of fixes is averaged
+
+
+class Arrivals:
+    """The newest fixes in the order in which they came, used or not, and where the receiver's clock was set back."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, float, float]] = []  # s; latitude and longitude
+        self.set_back: tuple[float, float] | None = None  # s, after which fix, and by how much
+
+    def add(self, t: float, place: tuple[float, ...]) -> None:
+        """A fix has come."""
+        self._rows = [*self._rows[-2 * RUN - 1 :], (t, place[0], place[1])]
+        if (
+            self.set_back is None
+            and len(self._rows) == 2 * RUN + 2
+            and self._rows[-RUN - 1][0] <= self._rows[-RUN - 2][0]
+        ):
+            rows = np.array(self._rows)
+            if (found := find_set_back(rows[:, 0], rows[:, 1:])) is not None:
+                self.set_back = float(rows[found[0], 0]), found[1]
 
 
 class Fixes(Buffer):
@@ -32,6 +53,7 @@ class Fixes(Buffer):
 
     def __init__(self, setup: Gnss | None) -> None:
         super().__init__(_WIDTH)
+        self.arrivals = Arrivals()
         self.left: list[float] = []  # s, fixes that were used until better ones of their span, or another copy, arrived
         self._states_residuals = False  # whether a fix has had an rms of its residuals
         self._selects = False  # whether not all fixes are used
@@ -78,6 +100,10 @@ class Fixes(Buffer):
         """Drop the rows before a time."""
         super().drop_before(t)
         self._filled = [one for one in self._filled if one[1] > t]
+
+    def forget_arrivals(self) -> None:
+        """Forget in which order fixes came: another clock begins."""
+        self.arrivals = Arrivals()
 
     def forget_typical(self) -> None:
         """Reset the typical sigmas: what follows is of another receiver or clock."""

@@ -25,7 +25,7 @@ from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.online.ahead import Live, export
-from graphnav.online.checks import check_filled, check_rows
+from graphnav.online.checks import add_stream, check_rows
 from graphnav.online.judgement import WindowJudge
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.noise_estimation import BackgroundEstimation, CatchUp, are_enough, start_estimation
@@ -258,7 +258,7 @@ class Smoother:
         return tracker
 
     def _take_findings(self, found: tuple[Finding, ...]) -> None:
-        self.findings = found = (*found, *check_filled(self.sensors.filled))
+        self.findings = found = add_stream(found, self.sensors)
         self._replace_notes("units", tuple(Note(f.key, f.sentence) for f in found))
 
     def _replace_notes(self, matter: str, words: tuple[str, ...]) -> None:

@@ -52,6 +52,8 @@ class Online(Smoother):
         """
         sensors, rows = self.sensors, [(row, released)]
         sensors.check_form(row)
+        if row[0] == "gnss" and not released:
+            sensors.gnss.arrivals.add(row[1], row[2])
         self._rows += 1
         if self._rows >= _REPORTED_AFTER and not self._rows & (self._rows - 1):  # at powers of two
             self._tell_counts()
@@ -83,7 +85,7 @@ class Online(Smoother):
     def _tell_counts(self) -> None:
         """Note what the rows left out so far say of the sensors."""
         self._replace_notes("counts", check_counts(self.sensors.counts))
-        self._take_findings(tuple(f for f in self.findings if f.key != "imu.filled"))
+        self._take_findings(self.findings)
 
     def _restart(self, before: float, why: str) -> None:
         super()._restart(before, why)
@@ -110,6 +112,7 @@ class Online(Smoother):
         """End the piece of the old clock; returns the rows of the new one, which are to be processed."""
         sensors = self.sensors
         rows, sensors.set_back = sensors.set_back, []
+        sensors.gnss.forget_arrivals()  # of the clock before
         first = next(t for sensor, t, _ in rows if sensor == "imu")
         before = sensors.imu.newest
         self.notes.append(

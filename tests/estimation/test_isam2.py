@@ -297,36 +297,45 @@ def test_keyframes_come_again_after_others_were_taken_back(drive: Drive) -> None
 
 
 def test_a_tree_made_again_from_its_rows_goes_on_as_before(built: Problem) -> None:
-    """What a checkpoint keeps of it, in the middle of a lag, with keyframes already marginalised."""
+    """What a checkpoint keeps in the middle of a lag: keyframes have been marginalised, and others are to leave."""
     import pickle
 
     window = play(built, 60)
     window.settle(40)
+    assert not window.smooth_back(5, 10)
+    assert not window.smooth_back(5, 10)
+    fill(window, built, 60, 62, every=1000)
     again = pickle.loads(pickle.dumps(window))
+    a, b = (one.settle(5) for one in (window, again))
+    np.testing.assert_array_equal(a.states.p, b.states.p)
+    np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-6, atol=1e-14)
     for one in (window, again):
-        fill(one, built, 60, 80, every=2)
+        fill(one, built, 62, 80, every=2)
     a, b = (one.settle(len(one)) for one in (window, again))
     np.testing.assert_allclose(a.states.p, b.states.p, atol=1e-6)
     np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-4, atol=1e-14)
     assert isinstance(a.states, States)
 
 
-def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(built: Problem) -> None:
-    """Of keyframes that are to leave a lag, in portions with others coming meanwhile, and after a relinearisation."""
+def test_covariances_from_the_other_end_are_the_marginals_of_the_tree_as_it_was(built: Problem) -> None:
+    """Of keyframes that are to leave a lag, in portions with others coming meanwhile, or a relinearisation."""
     window = play(built, 60)
     window.settle(20)
     tree = window.tree
     for again in (False, True):
         leaving, count = Elimination(tree, 6), 6
+        keyframes = tree.keyframes[:count]
+        expected = [tree.isam.marginalCovariance(k.state.key)[:DIM, :DIM] for k in keyframes]
+        delta, states = np.array([k.state.delta[:DIM] for k in keyframes]), [k.estimate for k in keyframes]
+        unit = tree.keyframes[0].state.unit[:DIM]
         assert not leaving.step(20)
         if again:
             tree.linearise_again(range(3, len(tree)), lambda a, b: [stage.place for stage in window.stages[a:b]])
-        expected = [tree.isam.marginalCovariance(k.state.key)[:DIM, :DIM] for k in tree.keyframes[:count]]
-        unit = tree.keyframes[0].state.unit[:DIM]
-        if not again:
+        else:
             fill(window, built, 60, 61)
+        tree.read()
         found = leaving.settle()
-        delta = np.array([k.state.delta[:DIM] for k in tree.keyframes[:count]])
+        assert np.abs(found.states.minus(States.stack(states))).max() < 1e-12
         own = move_covariance(unit[:, None] * np.array(expected) * unit, delta)
         for a, b in zip(found.covariance, own, strict=True):
             sd = np.sqrt(np.diag(b))

@@ -162,6 +162,21 @@ def test_a_fix_far_off_is_left_out_wherever_it_comes(
 
 
 # ------------------------------------------------------------------------------------------------------- clocks
+def test_a_receiver_whose_clock_is_set_back_is_told_at_the_end(
+    drive: tuple[Recording, Trajectory], rows: list[Row]
+) -> None:
+    """By a second, which stamps of its fixes alone show, and their places: late ones show nothing."""
+    middle = 0.5 * (rows[0][1] + rows[-1][1])
+    back = [(s, t - 1.0 * (s == "gnss" and t > middle), values) for s, t, values in rows]
+    late = sorted(rows, key=lambda row: row[1] + 3.0 * (row[0] == "gnss" and middle < row[1] < middle + 2.5))
+    for some, keys in ((back, ["gnss.clock_back"]), (late, []), (rows, [])):
+        online, track = played(drive[0], some, QUICK)
+        found = [one for one in online.findings if one.key == "gnss.clock_back"]
+        assert [one.key for one in found] == keys
+        assert all(one.severity == "refused" and "1.00 s" in one.sentence for one in found)
+        assert len(track.t) > 30
+
+
 def test_a_clock_that_is_set_back_begins_a_piece(
     drive: tuple[Recording, Trajectory], rows: list[Row], plain: Trajectory, tmp_path: Path
 ) -> None:

@@ -202,7 +202,7 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
     ),
     "time in ms": (every("imu.csv", shift_decimal(0, 1e3)), ("imu.time_unit", "imu.csv", 't = "ms"')),
     "time in us": (every("imu.csv", shift_decimal(0, 1e6)), ("imu.time_unit", "imu.csv", 't = "us"')),
-    "time in days": (content("imu.csv", IN_DAYS), ("imu.time_unit", "imu.csv", 't = "d"')),
+    "time in days": (content("imu.csv", IN_DAYS), ("table.days", "imu.csv", 't = "d"')),
     # positions
     "lat and lon swapped": (
         both(line("gnss.csv", 1, "t,lon,lat,h,sd_e,sd_n,sd_u")),
@@ -358,7 +358,7 @@ MENDED: dict[str, tuple[Break, tuple[str, ...], int]] = {
         ("imu.rows_unordered", "1", "0.030"),
         100,
     ),
-    "stamp in ms": (line("imu.csv", 50, "490,0,0,0,0,0,9.8"), ("imu.rows_stray", "1 IMU row", "490.000"), 99),
+    "stamp in ms": (line("imu.csv", 50, "490,0,0,0,0,0,9.8"), ("imu.stamps_lone", "1 IMU row", "490"), 100),
     "repeated": (line("imu.csv", 4, "0.02,5,5,5,5,5,5"), ("imu.rows_repeated", "1", "0.020"), 99),
     "NaN row": (line("imu.csv", 4, "0.03,0,nan,0,0,0,9.8"), ("imu.rows_blank", "1", "0.030"), 99),
     "blank cell": (line("imu.csv", 4, "0.03,0,,0,0,0,9.8"), ("imu.rows_blank", "1", "0.030"), 99),

@@ -557,6 +557,80 @@ def test_readings_that_are_missing_are_no_jump(tokyo: Recording) -> None:
     assert found(tokyo.without("odometer", (60.0, 78.0))) == {}
 
 
+@pytest.mark.parametrize("hertz", [1, 5])
+def test_fixes_of_a_clock_that_is_set_back_by_a_second_are_refused(
+    tmp_path: Path, tokyo: Recording, hertz: int
+) -> None:
+    """As where a receiver learns of a leap second: of one that moves, whose stamps alone are back."""
+    folder = copy_with_stamps(tmp_path, tokyo, "gnss", lambda t: t)
+    text = (folder / "gnss.csv").read_text().splitlines()
+    own = [row for row in text[1:] if abs(float(row.split(",")[0]) * hertz % 1.0 - 0.5) > 0.45]
+    t = np.array([float(row.split(",")[0]) for row in own])
+    moving = (
+        np.flatnonzero(np.linalg.norm(np.nan_to_num(tokyo.gnss.v), axis=1) > 8.0) if tokyo.gnss.v is not None else []
+    )
+    middle = tokyo.gnss.t[moving[len(moving) // 2]]
+
+    def write(stamps: np.ndarray, order: np.ndarray | None = None) -> None:
+        rows = [f"{x:.6f},{row.split(',', 1)[1]}" for x, row in zip(stamps, own, strict=True)]
+        rows = rows if order is None else [rows[k] for k in order]
+        (folder / "gnss.csv").write_text("\n".join([text[0], *rows]) + "\n")
+
+    write(t)
+    assert len(read(folder).gnss.t) == len(own)
+    write(t - 1.0 * (t > middle))
+    with refused("table.clock_back", RecordingError, "gnss.csv", "1.00 s"):
+        read(folder)
+    k = int(np.searchsorted(t, middle))
+    write(t, np.r_[0 : k - 3, k : k + 3, k - 3 : k, k + 3 : len(t)])  # written late
+    assert len(read(folder).gnss.t) == len(own)
+
+
+@pytest.mark.parametrize("wrong", [lambda t: 1000.0 * t, lambda t: 0.0 * t])
+def test_a_single_stamp_in_another_unit_is_taken_to_be_between_its_neighbours(
+    tmp_path: Path, tokyo: Recording, wrong: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    t = tokyo.imu.t
+    k = len(t) // 2
+
+    def change(stamps: np.ndarray) -> np.ndarray:
+        return np.where(np.arange(len(t)) == k, wrong(stamps), stamps)
+
+    found = read(copy_with_stamps(tmp_path, tokyo, "imu", change))
+    assert len(found.imu.t) == len(t)
+    np.testing.assert_allclose(found.imu.t[k], 0.5 * (t[k - 1] + t[k + 1]), atol=1e-5)
+    np.testing.assert_allclose(found.imu.gyro[k], tokyo.imu.gyro[k], atol=1e-6)
+
+
+def test_stamps_in_days_of_a_spreadsheet_are_told(tmp_path: Path, tokyo: Recording) -> None:
+    with refused("table.days", RecordingError, "imu.csv", "1899-12-30"):
+        read(copy_with_stamps(tmp_path, tokyo, "imu", lambda t: 46000.5 + t / 86400.0))
+    with refused("table.days", RecordingError, "gnss.csv", 't = "d"'):
+        read(copy_with_stamps(tmp_path, tokyo, "gnss", lambda t: 46000.5 + t / 86400.0))
+    seconds_of_a_day = read(copy_with_stamps(tmp_path, tokyo, "imu", lambda t: 46000.5 + t))
+    assert len(seconds_of_a_day.imu.t) == len(tokyo.imu.t)
+
+
+def copy_with_stamps(
+    folder: Path, recording: Recording, sensor: str, change: Callable[[np.ndarray], np.ndarray]
+) -> Path:
+    """A folder with the IMU and the fixes, stamps of one of them changed."""
+    (folder / "recording.toml").write_text(
+        'format = "graphnav-recording/1"\nplatform = "vehicle"\n[imu]\nfile = "imu.csv"\naxes = "RFU"\n'
+        '[gnss]\nfile = "gnss.csv"\n'
+    )
+    imu, gnss = recording.imu, recording.gnss
+    deg = np.degrees(gnss.llh[:, :2])
+    tables = {
+        "imu": (imu.t, np.column_stack([imu.gyro, imu.accel]), "t,gx,gy,gz,ax,ay,az"),
+        "gnss": (gnss.t, np.column_stack([deg, gnss.llh[:, 2], gnss.sd]), "t,lat,lon,h,sd_e,sd_n,sd_u"),
+    }
+    for name, (t, values, head) in tables.items():
+        table = np.column_stack([change(t) if name == sensor else t, values])
+        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header=head, comments="", fmt="%.11f")
+    return folder
+
+
 def test_a_clock_that_is_set_back_is_refused(tmp_path: Path, tokyo: Recording) -> None:
     t, v = tokyo.odometer.t, tokyo.odometer.speed
     rest = (

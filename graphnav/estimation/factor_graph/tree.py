@@ -59,15 +59,16 @@ from graphnav.estimation.solvers.stages import (
 NODE_EVERY = 30.0  # s from one node of a constant to the next
 _TIED = 1e-5  # of its prior sigma, by which a constant may differ from node to node: 0.03 % of it in ten hours
 _UNIT = np.repeat([1e-3, 1.0, 0.1, 1e-3, 1e-5], 3)  # of a state's errors, so that one threshold fits them all
+_TOGETHER, _GROWN = 16, 8  # keyframes that enter together, and what part of all of them if that is more
 _ALMOST = 0.3  # share of the threshold from which variables are relinearised along with those beyond it
 
 
 class Tree:
     """Keyframes in an iSAM2.
 
-    They wait, as a filter knows them, and enter together when the tree is read: what changes at a keyframe is
-    eliminated once for all of them, and `ISAM2.update` releases what it has eliminated clique by clique with all that
-    hangs below, which over a whole drive takes longer than all else.
+    They wait, as a filter knows them, and enter together when the tree is read, or has grown by an eighth: what changes
+    at a keyframe is eliminated once for all of them, and `ISAM2.update` releases what it has eliminated clique by
+    clique with all that hangs below, which over a whole drive takes longer than all else.
 
     Parameters
     ----------
@@ -87,7 +88,6 @@ class Tree:
         self.variables: dict[int, Variable] = {}
         self._first_sigma: dict[str, Array] = {}
         self._constant: set[str] = set()
-        self.version = 0  # grows when factors are replaced
         self.held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
 
     def __len__(self) -> int:
@@ -129,6 +129,8 @@ class Tree:
         self.keyframes.append(keyframe)
         self._waiting.append((made, known))
         self._number += 1
+        if len(self._waiting) > max(_TOGETHER, len(self) // _GROWN):
+            self._enter()
 
     def _add_first_keyframe(self, place: Place) -> None:
         """Add the initial message as a keyframe before the first."""
@@ -221,13 +223,14 @@ class Tree:
         self, made: Sequence[Made], gone: Sequence[int], first: int, fresh: Sequence[Variable] = (), known: Any = ()
     ) -> None:
         """Have factors in place of others, on keyframes from number `first` on."""
-        # elimination order is that of time; with much to do, GTSAM rebuilds the whole tree
+        # elimination order is that of time, in which those in force are the newest, though nothing new may touch them:
+        # else what leaves would stand above them. With much to do, GTSAM rebuilds the whole tree
         late = [v for v in self.variables.values() if v.last >= first]
-        every = 2 * len(late) > len(self.variables) and not fresh
-        if every:
+        if 2 * len(late) > len(self.variables) and not fresh:
             late, first = list(self.variables.values()), self.keyframes[0].number
-        order = [(v, v.last - first) for v in late]
-        update_isam(self.isam, self.keyframes[-1].t, made, gone, fresh, known, order, late if every else None)
+        order, new = [(v, v.last - first) for v in late], {v.key for v in fresh}
+        again = [v for v in late if v.key not in new]
+        update_isam(self.isam, self.keyframes[-1].t, made, gone, fresh, known, order, again)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:
@@ -301,7 +304,6 @@ class Tree:
         for i in rows:
             for x in self.keyframes[i].variables:
                 x.point = x.delta.copy()
-        self.version += 1
         self._replace(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
 
     # ---------------------------------------------------------------------------------------------------- leaving
@@ -326,7 +328,6 @@ class Tree:
             factors = self.isam.getFactorsUnsafe()
             alive = ((i, factors.at(i)) for i in range(factors.size()))
             own = [i for i, one in alive if one is not None and not late.isdisjoint(one.keys())]
-            self.version += 1
             self._replace([], own, last.number)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -346,6 +347,7 @@ class Tree:
 
     def marginalise(self, count: int) -> None:
         """Marginalise the first keyframes, and the parameters' nodes that only they touch."""
+        self._enter()
         first = self.keyframes[count].number
         gone = [x for x in self.variables.values() if x.last < first]
         stay = [x for x in self.variables.values() if x.last >= first]

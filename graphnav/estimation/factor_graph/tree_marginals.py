@@ -7,6 +7,8 @@ found by eliminating the tree's factors from the other end, the newest first, wh
 
 from __future__ import annotations
 
+from typing import Any
+
 import gtsam
 import numpy as np
 
@@ -83,7 +85,7 @@ def find_head(tree: Tree) -> Message:
 class Elimination:
     """Elimination of all keyframes of a tree behind some of the oldest, in portions, for the marginal of these.
 
-    Keyframes added since it began do not count; after a relinearisation it starts again.
+    It is of the tree as it was when it began: keyframes added since, and rows linearised again, do not count.
 
     Parameters
     ----------
@@ -91,62 +93,61 @@ class Elimination:
     """
 
     def __init__(self, tree: Tree, count: int, first: int = 0) -> None:
-        self._tree, self._which, self.count = tree, slice(first, count), count - first
-        self._begin()
-
-    def _begin(self) -> None:
-        tree, end = self._tree, self._which.stop
         tree.read()
-        self._version = tree.version
-        edge = tree.keyframes[end].number if end < len(tree) else np.inf
+        self.count, self._keyframes = count - first, tree.keyframes[first:count]
+        self._states, self._values = read_states(self._keyframes), tuple(k.values for k in self._keyframes)
+        self._moved = np.array([k.state.delta[:DIM] for k in self._keyframes])
+        edge = tree.keyframes[count].number if count < len(tree) else np.inf
         variables = tree.variables.values()
         self._behind = sorted((x for x in variables if x.first >= edge), key=lambda x: x.first)
         self._own = sorted((x for x in variables if x.first < edge), key=lambda x: x.last)
         self._graph = tree.isam.getFactorsUnsafe().linearize(tree.isam.getLinearizationPoint())
-        self._net: gtsam.GaussianBayesNet | None = None  # of the keyframes' own, at the end
+        self._found: dict[int, Array] = {}  # covariances by variable, in its units
 
     def step(self, most: int = _AT_ONCE) -> bool:
         """Eliminate at most so many variables of the keyframes behind, and at last those that leave; True once all
         is done.
         """
-        if self._tree.version != self._version:
-            self._begin()
         if self._behind:
             portion = slice(-min(most, _AT_ONCE), None)
             order = fill_keys(gtsam.Ordering(), reversed(self._behind[portion]))
             self._graph = self._graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
             del self._behind[portion]
-        elif self._net is None:
-            self._net = self._graph.eliminateSequential(fill_keys(gtsam.Ordering(), self._own), gtsam.EliminateQR)
+        elif not self._found:
+            net = self._graph.eliminateSequential(fill_keys(gtsam.Ordering(), self._own), gtsam.EliminateQR)
+            self._found = Eliminated(net).compute_covariances()
         else:
             return True
         return False
 
+    def __getstate__(self) -> dict[str, Any]:
+        """With all done, for which the graph is no longer needed."""
+        done = object.__new__(Elimination)
+        done.__dict__.update(self.__dict__, _behind=list(self._behind))
+        while not done.step():
+            pass
+        return {**done.__dict__, "_graph": None}
+
     def settle(self) -> SettledStates:
-        """States and parameters as they are known now, and covariances, all at once of what is left to be done."""
-        own = self._tree.keyframes[self._which]
+        """States, parameters and covariances, all at once of what is left to be done."""
+        own = self._keyframes
         try:
             while not self.step():
                 pass
         except RuntimeError:  # GTSAM's for a variable that nothing determines
             raise explain_undetermined(own[0].t) from None
-        assert self._net is not None
-        self._tree.read()
-        found = Eliminated(self._net).compute_covariances()
-        marginal = {x.key: x.unit[:, None] * found[x.key] * x.unit for x in self._own}
-        values, sigma = tuple(k.values for k in own), []
-        for k, known in zip(own, values, strict=True):
+        marginal, sigma = {x.key: x.unit[:, None] * self._found[x.key] * x.unit for x in self._own}, []
+        for k, known in zip(own, self._values, strict=True):
             out = np.zeros(len(known))
             for name, at in k.columns.items():
                 node, part = k.nodes[name]
                 out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
             sigma.append(out)
-        about = np.stack([marginal[k.state.key][:DIM, :DIM] for k in own])
         return SettledStates(
             t=np.array([k.t for k in own]),
-            states=read_states(own),
-            covariance=move_covariance(about, np.array([k.state.delta[:DIM] for k in own])),
+            states=self._states,
+            covariance=move_covariance(np.stack([marginal[k.state.key][:DIM, :DIM] for k in own]), self._moved),
             columns=tuple(k.columns for k in own),
-            values=values,
+            values=self._values,
             sigma=tuple(sigma),
         )

@@ -163,12 +163,16 @@ def are_leaves(isam: gtsam.ISAM2, variables: Iterable[Variable], others: Iterabl
     return not any(affected.count(x.key) for x in variables)
 
 
-def make_factor(parts: Iterable[VariablePart], b: Array) -> Any:
-    """Whitened rows A e = b as a factor of the tree."""
-    touched: dict[int, Array] = {}
+def make_factor(parts: Iterable[VariablePart], b: Array, here: bool = False) -> Any:
+    """Whitened rows A e = b as a factor of the tree, or A (e - d) = b of errors that are d `here`."""
+    touched: dict[int, tuple[Variable, Array]] = {}
     for x, at, A in parts:
-        touched.setdefault(x.key, np.zeros((len(b), len(x.unit)), order="F"))[:, at] += A * x.unit[at]
-    return gtsam.LinearContainerFactor(make_jacobian_factor(list(touched.items()), b))
+        if x.key not in touched:
+            touched[x.key] = x, np.zeros((len(b), len(x.unit)), order="F")
+        touched[x.key][1][:, at] += A
+    if here:
+        b = b + sum(A @ x.delta for x, A in touched.values())
+    return gtsam.LinearContainerFactor(make_jacobian_factor([(x.key, A * x.unit) for x, A in touched.values()], b))
 
 
 def compute_turns(keyframes: Sequence[Keyframe]) -> Array:
@@ -193,8 +197,7 @@ def _make_factor(keyframe: Keyframe, states: Sequence[tuple[Variable, Array]], H
     """A factor of rows over states' errors about anchors and a keyframe's parameters, H (m, D), as they are now."""
     filled: list[bool] = np.any(H, axis=0).tolist()
     touched = ((*keyframe.nodes[name], H[:, at]) for name, at in keyframe.columns.items() if any(filled[at]))
-    parts = [*((x, slice(0, DIM), A) for x, A in states), *touched]
-    return make_factor(parts, b + sum(A @ x.delta[at] for x, at, A in parts))
+    return make_factor([*((x, slice(0, DIM), A) for x, A in states), *touched], b, here=True)
 
 
 def read_states(keyframes: Sequence[Keyframe]) -> States:

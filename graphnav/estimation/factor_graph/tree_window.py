@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -31,6 +30,7 @@ from graphnav.estimation.solvers.stages import Message, Place, Stage
 from graphnav.estimation.solvers.window import Window
 
 _MAX_STEPS = 5
+_LATER = 0.4  # of the usual limits, within which keyframes may wait until they settle
 _CONVERGED_SHARE = 0.02  # of the usual limits, within which the last window is converged
 
 
@@ -38,6 +38,7 @@ class TreeWindow(Window):
     """A window whose estimates are a `Tree`'s."""
 
     solver = "isam2"
+    smoothed = 40
 
     def __init__(self, prior: Message, turn: float) -> None:
         super().__init__(prior, turn)
@@ -67,6 +68,11 @@ class TreeWindow(Window):
         """As of `Window`."""
         self.tree.read()
         return read_states(self.tree.keyframes[self.tree.held :])
+
+    def needs_revision(self, share: float, count: int) -> bool:
+        """As of `Window`; those that do not settle yet may have moved further: all since would be eliminated anew."""
+        moves = self._find_moves()
+        return bool(np.any(moves[:count] > share) or np.any(moves > max(share, _LATER)))
 
     def _find_moves(self) -> Array:
         if self.stages:
@@ -107,10 +113,6 @@ class TreeWindow(Window):
         if count == len(self.stages):
             self.tree.release()
         return leaving
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but what has been done for stages that are to leave, which is made again."""
-        return {**self.__dict__, "_leaving": None}
 
     def _relinearise_keyframes(self, count: int) -> None:
         self.relinearized += count

@@ -27,6 +27,7 @@ _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 # a look at what has moved of a whole drive costs as much as there are keyframes: the next one follows when there are a
 # part in this many more, and at least so many
 _GROWN, _LEAST = 8, 10
+_SHORT = 2  # portions of a window over which covariances are smoothed all at once
 _MAX_INTEGRATIONS = 5  # computing: rounds of integrating about the present biases and relinearising
 # shares of the usual limits within which keyframes have converged that settle, as they are not linearised again
 _SETTLING, _FINE = 0.25, 0.02  # and all that remain at the end
@@ -61,24 +62,30 @@ class Incremental:
         if window.push(replace(place, problem=self.problem)) > window.turn or grown:
             window.converge(renewed=self._renew)
             self.look = len(window) + max(_LEAST, len(window) // _GROWN)
-        if are_due(window.stages[0].place.t, place.t, self.lag):
-            self._converge(_SETTLING, any(c.robust != "none" for c in self.problem.constraints))
-            self.settled.append(window.settle(int(np.searchsorted(window.t, place.t - self.lag))))
+        count = window.leaving
+        if not count and are_due(window.stages[0].place.t, place.t, self.lag):
+            count = int(np.searchsorted(window.t, place.t - self.lag))
+            self._converge(count, _SETTLING, any(c.robust != "none" for c in self.problem.constraints))
+        if count and (window.smooth_back(count, window.smoothed) or len(window) <= _SHORT * window.smoothed):
+            self.settled.append(window.settle(count))
 
     def finish(self) -> None:
         """End of input: settle all."""
         if len(self.window):
-            self._converge(_FINE, always=True)
+            self._converge(len(self.window), _FINE, always=True)
             self.settled.append(self.window.settle(len(self.window)))
 
-    def _converge(self, share: float = 1.0, always: bool = False) -> None:
-        """Relinearise until nothing has moved, about intervals integrated at the present biases."""
+    def _converge(self, count: int, share: float, always: bool = False) -> None:
+        """Relinearise until nothing has moved, about intervals integrated at the present biases, for the first stages
+        to settle.
+        """
         window, newest = self.window, self.window.newest
         for _ in range(_MAX_INTEGRATIONS):
             states, scale = window.read_states(), scale_at(newest.columns, newest.values)
-            self.problem, count = integrate_again(self.problem, states, scale, window.stages[0].place.k)
-            window.converge(share, always or count > 0, self._renew)
-            if not count:
+            self.problem, again = integrate_again(self.problem, states, scale, window.stages[0].place.k)
+            if always or again > 0 or window.needs_revision(share, count):
+                window.converge(share, always or again > 0, self._renew)
+            if not again:
                 return
 
     def _renew(self, first: int, end: int) -> list[Place]:

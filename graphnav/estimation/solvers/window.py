@@ -10,6 +10,7 @@ than the drive this is the batch solution.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol
@@ -121,6 +122,7 @@ class Window:
     """
 
     solver: ClassVar[str] = "incremental"  # of a recording's keyframes, by this window
+    smoothed: ClassVar[int] = sys.maxsize  # stages over which covariances are smoothed at once, at most
 
     def __init__(self, prior: Message, turn: float) -> None:
         self.turn = turn
@@ -242,10 +244,13 @@ class Window:
     def smooth_back(self, count: int, most: int) -> bool:
         """A portion of `settle` for the first stages, over at most so many; True once it is done.
 
-        Keyframes that arrive meanwhile do not count; when some are removed, it starts again.
+        Keyframes that arrive meanwhile do not count; when some are removed, it starts again. To begin is a portion,
+        where one is not all.
         """
         if self._leaving is None:
             self._leaving = self._begin_leaving(count)
+            if most < len(self):
+                return False
         return self._leaving.step(most)
 
     def _begin_leaving(self, count: int) -> Leaving:
@@ -278,6 +283,10 @@ class Window:
         """
         moves = self._find_moves()
         return int(np.argmax(moves > almost * share)) if np.any(moves > share) else None
+
+    def needs_revision(self, share: float, count: int) -> bool:
+        """Whether `revise`, with that share of the limits, is to do anything before the first `count` stages settle."""
+        return self.find_first_moved(share) is not None
 
     def _find_moves(self) -> Array:
         """(n,) how far the smoothed states are from their points, 1 at the limit."""

@@ -10,15 +10,26 @@ from numpy.typing import NDArray
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import UNIX
+from graphnav.core.timescales import UNIX, find_restarts
 from graphnav.recording import FIX_TYPES, convert_fix_types
-from graphnav.recording.formats.stamps import format_row_count, order_rows
+from graphnav.recording.formats.stamps import (
+    check_days,
+    check_fix_clock,
+    check_imu_steps,
+    check_passes,
+    find_lone_stamps,
+    find_repeated,
+    format_row_count,
+    take_halfway,
+    tell_rounding,
+)
 from graphnav.recording.formats.table import Selection, Table
 from graphnav.sensors.tables import LATEST, TIME_UNITS, Keep
 
 _SENSOR_LABELS = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
 VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a larger sigma carries no information
 _LEAST_SIGMA = 1e-9  # m, m/s; a smaller sigma is not meant as one
+
 # 1-sigma where a recording states none, from the GPS Standard Positioning Service Performance Standard (5th ed.,
 # 2020, section 3.8): 8 m horizontal (2.45 sigma in two dimensions) and 13 m vertical (1.96 sigma), both 95 %.
 DEFAULT_SD = (3.3, 3.3, 6.6)  # m
@@ -85,7 +96,46 @@ def select_usable_rows(
         remarks.add(f"{sensor}.rows_blank", f"{format_row_count(blank, label)} with {what} values dropped{at}")
         rows = rows.take(~blank)
 
-    rows = order_rows(rows, sensor, label, unit, offset, stamps, remarks)
+    check_days(rows, unit)
+    if (lone := find_lone_stamps(rows["t"])).any():
+        k = int(np.flatnonzero(lone)[0])
+        remarks.add(
+            f"{sensor}.stamps_lone",
+            f"{format_row_count(lone, label)} with a stamp far from those around it (first {rows['t'][k]:.10g} s, "
+            f"after t = {rows['t'][k - 1]:.3f} s) taken to be halfway between them",
+        )
+        rows = rows.with_column("t", np.where(lone, take_halfway(rows["t"]), rows["t"]))
+    scale = TIME_UNITS[unit]
+    if (later := find_restarts((rows["t"] - offset) / scale, scale)) is not None:
+        remarks.add(
+            f"{sensor}.clock_again",
+            f"the clock of the {label} restarts at 0: {later.max() * scale:g} s are added after it",
+        )
+        rows = rows.with_column("t", rows["t"] + later * scale)
+    t = rows["t"]
+    if "lat" in rows and "lon" in rows:
+        check_fix_clock(rows, label)
+    step = np.diff(t)
+    if (step < 0).any():
+        first = np.flatnonzero(step < 0)[0]
+        check_passes(rows, label)
+        remarks.add(
+            f"{sensor}.rows_unordered",
+            f"{label} rows out of order sorted by time ({format_count((step < 0).sum(), 'step')} back, "
+            f"the first after t = {t[first]:.3f} s)",
+        )
+        rows = rows.take(np.argsort(t, kind="stable"))
+        t = rows["t"]
+    repeated = find_repeated(f"{rows.path}, column '{rows.file_names['t']}'", t)
+    if repeated.any():
+        remarks.add(
+            f"{sensor}.rows_repeated",
+            f"{format_row_count(repeated, label)} with the time of the row before dropped "
+            f"(first at t = {t[repeated][0]:.3f} s){tell_rounding(stamps, repeated)}",
+        )
+        rows = rows.take(~repeated)
+    if sensor == "imu":
+        check_imu_steps(rows, unit)
     if sensor == "gnss" and not (new := mask_new_fixes(rows.columns)).all():
         rows = rows.take(new)
         held = format_row_count(~new, "GNSS")

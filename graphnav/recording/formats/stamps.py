@@ -1,4 +1,4 @@
-"""Stamps of the rows of a sensor's file: stray ones, clocks that restart or are set back, rows out of order."""
+"""Stamps of a sensor's rows in the order of its file: what no clock that goes on tells."""
 
 from __future__ import annotations
 
@@ -6,122 +6,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Notes, format_count
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import find_restarts
+from graphnav.core.timescales import DAY
 from graphnav.recording.formats.table import Selection, Table
 from graphnav.sensors.tables import TIME_UNITS
 
-_OVERTAKING = 3.0  # periods, by which rows are late that others overtake on their way
-_FAR = 10.0  # periods; rows that are written later are closer to the others
+_SPREADSHEET_DAYS = 20_000.0, 80_000.0  # since 1899-12-30: from 1954 to 2119
+_LONGEST_STEP = 10.0  # s between rows of a sensor
+_FAR = 10.0  # periods; rows that overtake each other are closer
+_SET_BACK = 3.0  # periods, of a clock; times are then there twice, and not only out of order
 _TWICE = 1.5  # rows to a period above which, between one and two, a time is there twice
 _PAUSE = 1.0  # s; longer steps of an IMU are gaps
 _BURST = 0.3  # ratio of median to mean step below which rows come in bursts
 _ROUNDED_AWAY = 0.05  # share of the stamps that repeat the one before, where a rounding makes them
 _REPEATED = 0.6  # share of rows with the stamp of the previous row above which the log is refused
+_ROOM = 1.5, 3.0  # periods between two rows that leave room for one between them
+RUN = 5  # steps on either side of one that show whether a clock goes on as it did
+_UNEVEN = 0.25  # share of a step by which those of a run may differ from it
+_ABOVE_NOISE = 4.0  # times by which moves of fixes differ from the mean of those around them, that they are to be
 
 
-def format_row_count(mask: Selection, label: str) -> str:
-    """The number of rows in a mask (N,), with the sensor's label."""
-    return format_count(mask.sum(), f"{label} row".strip())
-
-
-def order_rows(rows: Table, sensor: str, label: str, unit: str, offset: float, stamps: Array, remarks: Notes) -> Table:
-    """The rows ordered by time, without stray stamps and repeated times.
-
-    Parameters
-    ----------
-    rows : complete ones, their t in seconds plus `offset`.
-    label : the sensor's name, in words.
-    stamps : of all rows as the file has them, in `unit`.
-
-    Raises
-    ------
-    RecordingError
-        If the stamps run over the same times twice, or most of an IMU's cannot be right.
-    """
-    scale = TIME_UNITS[unit]
-    if (later := find_restarts((rows["t"] - offset) / scale, scale)) is not None:
-        remarks.add(
-            f"{sensor}.clock_again",
-            f"the clock of the {label} restarts at 0: {later.max() * scale:g} s are added after it",
-        )
-        rows = rows.with_column("t", rows["t"] + later * scale)
-    if (stray := find_stray(rows["t"])).any():
-        remarks.add(
-            f"{sensor}.rows_stray",
-            f"{format_row_count(stray, label)} dropped with a stamp before that of the file's first row or after that "
-            f"of its last (first {rows['t'][stray][0]:.3f} s)",
-        )
-        rows = rows.take(~stray)
-    t = rows["t"]
-    step = np.diff(t)
-    if (step < 0).any():
-        first = np.flatnonzero(step < 0)[0]
-        _check_passes(rows, label)
-        remarks.add(
-            f"{sensor}.rows_unordered",
-            f"{label} rows out of order sorted by time ({format_count((step < 0).sum(), 'step')} back, "
-            f"the first after t = {t[first]:.3f} s)",
-        )
-        rows = rows.take(np.argsort(t, kind="stable"))
-        t = rows["t"]
-    repeated = find_repeated(f"{rows.path}, column '{rows.file_names['t']}'", t)
-    if repeated.any():
-        remarks.add(
-            f"{sensor}.rows_repeated",
-            f"{format_row_count(repeated, label)} with the time of the row before dropped "
-            f"(first at t = {t[repeated][0]:.3f} s){_tell_rounding(stamps, repeated)}",
-        )
-        rows = rows.take(~repeated)
-    if sensor == "imu":
-        _check_imu_time(rows, unit)
-    return rows
-
-
-def find_stray(t: Array) -> NDArray[np.bool_]:
-    """(N,) which stamps, in the order of the file, cannot be right: far before the first or far behind the last.
-
-    None where so many are that these two may be the wrong ones, or where the others are in no order either.
-    """
-    if len(t) < 3 or t[-1] < t[0]:
-        return np.zeros(len(t), dtype=bool)
-    far = _FAR * _compute_period(t)
-    stray = (t < t[0] - far) | (t > t[-1] + far)
-    return stray & (stray.mean() < 0.5 and float(np.min(np.diff(t[~stray]))) > -far)
-
-
-def _compute_period(t: Array) -> float:
-    """The median step between stamps (N,) in any order."""
-    steps = np.diff(np.unique(t))
-    return float(np.median(steps)) if len(steps) else 0.0
-
-
-def _check_passes(rows: Table, label: str) -> None:
-    """Refuse a clock that was set back: the times before it are then there twice, with other rows."""
-    t = rows["t"]
-    period = _compute_period(t)
-    back = np.flatnonzero(np.diff(t) < -_OVERTAKING * period)
-    for k in back[:20]:
-        again = float(t[k + 1])
-        before = np.flatnonzero(t[: k + 1] >= again)
-        after = k + 1 + np.flatnonzero(t[k + 1 :] <= t[k])
-        # rows that were only written late fill the gap that they left
-        begin, end = max(t[before].min(), t[after].min()), min(t[before].max(), t[after].max())
-        shared = end - begin
-        if shared < max(0.5 * (t[k] - again), _OVERTAKING * period):
-            continue
-        both = np.concatenate([before, after])
-        both = both[(t[both] >= begin) & (t[both] <= end)]
-        different = len(np.unique(np.column_stack([x[both] for x in rows.columns.values()]), axis=0))
-        if different > _TWICE * (shared / period + 1.0):
-            jump = float(t[k] - again + period)
-            leap = " (GPS time and UTC are 18 s apart)" if abs(jump - 18.0) < 0.5 else ""
-            raise RecordingError(
-                f"{rows.path}: the clock of the {label} is set back by {jump:.2f} s after t = {t[k]:.3f} s{leap}: what "
-                "lies between is there twice; write all stamps on one clock",
-                key="table.clock_back",
-            )
+def tell_rounding(stamps: Array, repeated: NDArray[np.bool_]) -> str:
+    """'; ...' where stamps (N,), in the file's unit, repeat because they went through single precision."""
+    known = stamps[np.isfinite(stamps)]
+    step = np.spacing(np.float32(np.abs(known).max())) if len(known) else 0.0
+    if repeated.mean() < _ROUNDED_AWAY or not np.array_equal(known, known.astype(np.float32)):
+        return ""
+    return f": stamps are rounded to {step:g}, as single-precision numbers are; write them with double precision"
 
 
 def find_repeated(where: str, t: Array) -> NDArray[np.bool_]:
@@ -142,16 +54,122 @@ def find_repeated(where: str, t: Array) -> NDArray[np.bool_]:
     return repeated
 
 
-def _tell_rounding(stamps: Array, repeated: NDArray[np.bool_]) -> str:
-    """'; ...' where stamps (N,), in the file's unit, repeat because they went through single precision."""
-    known = stamps[np.isfinite(stamps)]
-    step = np.spacing(np.float32(np.abs(known).max())) if len(known) else 0.0
-    if repeated.mean() < _ROUNDED_AWAY or not np.array_equal(known, known.astype(np.float32)):
-        return ""
-    return f": stamps are rounded to {step:g}, as single-precision numbers are; write them with double precision"
+def check_days(rows: Table, unit: str) -> None:
+    """Refuse stamps that count days as spreadsheets do, from 1899-12-30 on, and are said to be in seconds."""
+    t = rows["t"]
+    step = _compute_period(t)
+    low, high = _SPREADSHEET_DAYS
+    if unit == "s" and low < t.min() and t.max() < high and 0.0 < step * DAY < _LONGEST_STEP:
+        raise RecordingError(
+            f"{rows.path}: column '{rows.file_names['t']}' counts days, from {t[0]:.9g} on, as spreadsheets do from "
+            '1899-12-30: set units = { t = "d" }',
+            key="table.days",
+        )
 
 
-def _check_imu_time(rows: Table, unit: str) -> None:
+def find_lone_stamps(t: Array) -> NDArray[np.bool_]:
+    """(N,) mask of stamps far from those before and after, which have room for one row between them.
+
+    A row that was written late leaves no such room where it stands.
+    """
+    out = np.zeros(len(t), dtype=bool)
+    if len(t) > RUN:
+        period = _compute_period(t)
+        before, after, far = t[:-2], t[2:], _FAR * period
+        room = (after - before > _ROOM[0] * period) & (after - before < _ROOM[1] * period)
+        out[1:-1] = room & ((t[1:-1] < before - far) | (t[1:-1] > after + far))
+    return out
+
+
+def take_halfway(t: Array) -> Array:
+    """(N,) means of the stamps before and after each; the first and the last as they are."""
+    out = t.copy()
+    out[1:-1] = 0.5 * (t[:-2] + t[2:])
+    return out
+
+
+def find_set_back(t: Array, p: Array) -> tuple[int, float] | None:
+    """The last fix before the clock of a moving receiver is set back by less than rows overtake each other, and by
+    how much, s; None where it is not.
+
+    Before and after, stamps go on evenly; between them they repeat or step back, while the receiver moves as far as in
+    any other step. A fix that was written late is back where it was.
+
+    Parameters
+    ----------
+    t : (N,) s, in the order in which they were written.
+    p : (N, k) positions, in any unit.
+    """
+    steps = np.diff(t)
+    if len(t) < 2 * RUN + 2 or not (steps > 0.0).any():
+        return None
+    period = float(np.median(steps[steps > 0.0]))
+    for k in np.flatnonzero(steps < 0.5 * period).tolist():
+        if k < RUN or k + 1 + RUN >= len(t):
+            continue
+        runs = slice(k - RUN, k + 1), slice(k + 1, k + 2 + RUN)
+        if any(np.abs(np.diff(t[run]) - period).max() > _UNEVEN * period for run in runs):
+            continue
+        before, after = (np.diff(p[run], axis=0) for run in runs)
+        usual, jump = 0.5 * (before[-1] + after[0]), period - steps[k]
+        bends = [some[1:-1] - 0.5 * (some[:-2] + some[2:]) for some in (before, after)]
+        scatter, back = np.linalg.norm(np.concatenate(bends), axis=1).max(), np.linalg.norm(usual) * jump / period
+        if back > _ABOVE_NOISE * scatter and np.linalg.norm(p[k + 1] - p[k] - usual) < 0.5 * back:
+            return k, float(jump)
+    return None
+
+
+def check_fix_clock(rows: Table, label: str) -> None:
+    """Refuse fixes whose clock is set back by about a second, in which a receiver learns of a leap second."""
+    found = find_set_back(rows["t"], rows.stack("lat", "lon"))
+    if found is not None:
+        words = describe_set_back(label, float(rows["t"][found[0]]), found[1])
+        raise RecordingError(f"{rows.path}: the {words}; write all stamps on one clock", key="table.clock_back")
+
+
+def describe_set_back(label: str, t: float, jump: float) -> str:
+    """In words, of a sensor, after a time and by how much, s."""
+    leap = " (GPS time and UTC are 18 s apart)" if abs(jump - 18.0) < 0.5 else ""
+    return (
+        f"clock of the {label} is set back by {jump:.2f} s after t = {t:.3f} s{leap}: what lies between is there twice"
+    )
+
+
+def check_passes(rows: Table, label: str) -> None:
+    """Refuse a clock that was set back: the times before it are then there twice, with other rows."""
+    t = rows["t"]
+    period = _compute_period(t)
+    back = np.flatnonzero(np.diff(t) < -_SET_BACK * period)
+    for k in back[:20]:
+        again = float(t[k + 1])
+        before = np.flatnonzero(t[: k + 1] >= again)
+        after = k + 1 + np.flatnonzero(t[k + 1 :] <= t[k])
+        # rows that were only written late fill the gap that they left
+        begin, end = max(t[before].min(), t[after].min()), min(t[before].max(), t[after].max())
+        shared = end - begin
+        if shared < max(0.5 * (t[k] - again), _SET_BACK * period):
+            continue
+        both = np.concatenate([before, after])
+        both = both[(t[both] >= begin) & (t[both] <= end)]
+        different = len(np.unique(np.column_stack([x[both] for x in rows.columns.values()]), axis=0))
+        if different > _TWICE * (shared / period + 1.0):
+            jump = float(t[k] - again + period)
+            words = describe_set_back(label, float(t[k]), jump)
+            raise RecordingError(f"{rows.path}: the {words}; write all stamps on one clock", key="table.clock_back")
+
+
+def _compute_period(t: Array) -> float:
+    """The median step between stamps (N,) in any order."""
+    steps = np.diff(np.unique(t))
+    return float(np.median(steps)) if len(steps) else 0.0
+
+
+def format_row_count(mask: Selection, label: str) -> str:
+    """The number of rows in a mask (N,), with the sensor's label."""
+    return format_count(mask.sum(), f"{label} row".strip())
+
+
+def check_imu_steps(rows: Table, unit: str) -> None:
     if len(rows) < 2:
         raise RecordingError(
             f"{rows.path}: {len(rows)} usable row; an IMU recording needs at least 2", key="table.few_rows"
