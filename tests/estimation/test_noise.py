@@ -101,7 +101,7 @@ def moments(problem: Problem, about: Points) -> dict[str, tuple[float, float]]:
         out |= {g: (A[:, own == g].sum(), B[:, own == g].sum()) for g in chain.parameter.noise_groups}
     for rows in problem.constraints:
         names, index = rows.list_noise_groups()
-        found = collect_row_moments(problem, rows, smoothed, len(rows))
+        found = collect_row_moments(rows, smoothed.take_rows(rows))
         out |= {g: (found.A[index == i].sum(), found.B[index == i].sum()) for i, g in enumerate(names)}
     return out
 
@@ -136,7 +136,7 @@ def test_what_a_row_is_off_by_is_that_of_a_smoother_without_it(row: int) -> None
         return replace(rows, weight=weight), smooth_backward(some, refilter(some, about))
 
     rows, smoothed = smooth(without=False)
-    found = collect_row_moments(used, rows, smoothed, len(rows)).left_out[row]
+    found = collect_row_moments(rows, smoothed.take_rows(rows, used.columns)).left_out[row]
     _, without = smooth(without=True)
     linear = linearise(rows, without, used.columns, slice(row, row + 1))
     H, P = linear.H[0], without.P[rows.keyframe[row]]
@@ -274,7 +274,7 @@ def mixed(base: Problem, opening: float | None) -> tuple[Problem, NoiseModel, Sm
 
 
 def test_a_pass_for_a_noise_model_says_what_one_with_all_covariances_says() -> None:
-    """Rows linearised where it leads, of other sigmas too, and the next pass by them."""
+    """Of rows as well, and of the points for the next pass."""
     stated, opening = built(lap())
     base, noise, about = mixed(stated, opening)
     whole = smooth_backward(base, refilter(base, about))
@@ -284,16 +284,18 @@ def test_a_pass_for_a_noise_model_says_what_one_with_all_covariances_says() -> N
         if chain.parameter.correlation_time is not None:
             at = base.columns[chain.parameter.name]
             np.testing.assert_allclose(short.variance[1:, at], whole.variance[1:, at], rtol=1e-6)
+    for rows in base.constraints:
+        found, expected = short.take_rows(rows), whole.take_rows(rows, base.columns)
+        np.testing.assert_allclose(found.residual, expected.residual, atol=1e-6 * np.min(expected.sigma))
+        np.testing.assert_array_equal(found.sigma, expected.sigma)
+        least = 1e-6 * np.min(expected.sigma) ** 2
+        np.testing.assert_allclose(found.covariance[1:], expected.covariance[1:], atol=least)
     larger = {name: VarianceComponent(figure.log_factor + 1.0) for name, figure in noise.figures.items()}
     for problem in (base, apply_noise(stated, replace(noise, figures=larger))):
         for rows in problem.constraints:
-            n = len(rows)
             one, other = (linearise(rows, some, problem.columns) for some in (short, whole))
             for name in ("residual", "stated", "H"):
                 np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-8)
-            if rows.list_noise_groups()[0]:
-                found, expected = (some.cover_rows(other, n) for some in (short, whole))
-                np.testing.assert_allclose(found[1:], expected[1:], atol=1e-6 * np.min(other.stated) ** 2)
         likelihood = [refilter(problem, some).log_likelihood.sum() for some in (short, whole)]
         assert likelihood[0] == pytest.approx(likelihood[1], abs=1e-4)
 

@@ -200,7 +200,7 @@ def _iterate(
     assert latest is not None
     figures.sigmas = figures.compute_sigmas(information)
     passes = Counter(filter=round(done / total), smoother=round(done / total))
-    return NoiseEstimate(figures.build_model(), latest[1].drop_rows(), prior_then, evidence, passes)
+    return NoiseEstimate(figures.build_model(), latest[1], prior_then, evidence, passes)
 
 
 def _average(problem: Problem, figures: Components, before: Components) -> None:

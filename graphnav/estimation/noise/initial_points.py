@@ -84,7 +84,8 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
     weights = {}
     for rows in sound.constraints:
         if rows.weight is not None and np.any(rows.weight == 0.0):
-            left_out, m = collect_row_moments(sound, rows, smoothed, len(rows)).left_out, len(rows.axes)
+            m, own = len(rows.axes), smoothed.take_rows(rows, sound.columns)
+            left_out = collect_row_moments(rows, own).left_out
             every = np.ones(len(rows), dtype=bool)
             weight = weigh_scaled(left_out, m, get_tail_index({}, rows.name, m), every)
             weights[rows.name] = list_reduced(sound.t[rows.keyframe], weight, every)
