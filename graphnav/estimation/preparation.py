@@ -276,8 +276,8 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
                 foreseen.passes.end()
             forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge
-        (initial, *_), more = find_initial_points(problem, aligned.until)
-        passes.update(filter=more, smoother=more)
+        initial = next(find_initial_points(problem, aligned.until))
+        passes.update(filter=initial.passes, smoother=initial.passes)
         forward, smoothed = _filter_and_smooth(problem, aligned.until, initial.points, clock, progress)
     if begun.larger:
         with clock.count_time("noise"):

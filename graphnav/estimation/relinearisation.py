@@ -81,7 +81,8 @@ def linearise_searched(
     EstimationError
         If the filter breaks down.
     """
-    initials, spent = find_initial_points(problem, aligned.until)
+    initials = list(find_initial_points(problem, aligned.until))
+    spent = sum(one.passes for one in initials)
     passes.update(filter=spent, smoother=spent)
     starts = [one.points for one in initials]
     near = [_descend(problem, start, passes) for start in starts]

@@ -143,7 +143,7 @@ def weigh_tails(noise: NoiseModel, used: Problem, smoothed: SmootherPass) -> Noi
     weights = dict(noise.weights)
     for rows in used.constraints:
         if rows.list_noise_groups()[0] and not rows.of_stops and len(rows):
-            left_out, m = collect_row_moments(used, rows, smoothed, len(rows)).left_out, len(rows.axes)
+            left_out, m = collect_row_moments(rows, smoothed.take_rows(rows, used.columns)).left_out, len(rows.axes)
             before = np.ones(len(rows)) if rows.weight is None else rows.weight
             weight = np.minimum(before, weigh_outlying(left_out, m, get_tail_index({}, rows.name, m)))
             weights[rows.name] = list_reduced(used.t[rows.keyframe], weight, before > 0.0)

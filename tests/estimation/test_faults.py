@@ -33,6 +33,7 @@ from graphnav.estimation.noise.explanations import (
     EXPLANATIONS,
     ErrorSizes,
     PriorCosts,
+    Trials,
     add_common_errors,
     compute_evidence,
 )
@@ -326,6 +327,26 @@ def test_evidence_of_a_common_error_with_outliers_besides(built: Problem) -> Non
     each = 0.5 * (index + 3.0) * (1.0 + np.log(squared / (index + 3.0)))
     others = float(compute_log_normaliser(index, 3)) * np.sum((t >= span[0]) & (t <= span[1]))
     assert evidence[0] - evidence[1] == pytest.approx(np.sum(each) + others, rel=0.15)
+
+
+def test_weights_of_outliers_raise_the_evidence(built: Problem) -> None:
+    """Fixes that leave a common error by turns, so that each looks right beside others that are as wrong."""
+    about = ekf(built)
+    rows = next(c for c in built.constraints if c.name == "gnss_position")
+    span = (83.0, 199.0)
+    t = built.t[rows.keyframe]
+    inside = (t >= span[0]) & (t <= span[1])
+    off = np.zeros((len(t), 3))
+    off[inside] = 40.0 * np.sin((t[inside, None] - span[0]) * [0.1, 0.07, 0.13])
+    wrong = replace(rows, p_n=rows.p_n + off)
+    problem = replace(built, constraints=tuple(wrong if c is rows else c for c in built.constraints))
+    trials, kinds, tails = Trials(problem, about, [span]), (rows.name,), {rows.name: 4.0}
+    evidence = []
+    for _ in range(8):
+        problem, cost = trials.weigh_outliers(problem, kinds, np.array([True]), tails)
+        likelihood = trials.filter(add_common_errors(problem, [span], kinds), kinds).log_likelihood()
+        evidence.append(float(likelihood.sum() - cost.sum()))
+    assert np.all(np.diff(evidence) > 0.0)
 
 
 def test_evidence_of_explanations_in_succession(built: Problem) -> None:

@@ -68,8 +68,8 @@ def test_a_filter_that_diverges_is_taken_to_the_optimum_that_another_estimate_fo
 def test_what_is_searched_for_is_found_again(
     shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Circles with two bursts of wrong fixes, whose filter ends elsewhere; and it repeated."""
-    _, _, damaged = draw_damaged(shared_data, monkeypatch, 5150, 11)
+    """Circles with bursts of wrong fixes and an outage, whose filter ends elsewhere; and it repeated."""
+    _, _, damaged = draw_damaged(shared_data, monkeypatch, 1, 189)
     settings = Settings()
     found = graphnav.run(damaged, settings, ("ekf", "rts"))
     noise = found["rts"].noise

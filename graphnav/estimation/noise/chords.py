@@ -23,7 +23,6 @@ from graphnav.estimation.noise.outliers import OUTLIER_COST
 from graphnav.estimation.noise.spans import mask_times
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.linearise import linearise
 from graphnav.estimation.solvers.rts import smooth_backward
 
 _INSIDE = 1e-6  # s from the rows of the IMU at the ends of a gap
@@ -63,8 +62,8 @@ def find_filled_gaps(problem: Problem, opening: float | None) -> tuple[Array, in
     used = weigh_rows(problem, {name: np.where(some, 0.0, 1.0) for name, some in inside.items()})
     smoothed = smooth_backward(used, ekf(used, opening=opening))
     own = np.flatnonzero(inside[rows.name])
-    linear = linearise(rows, smoothed, used.columns)
-    S = (smoothed.cover_rows(linear, len(rows)) + linear.stated[:, :, None] ** 2 * np.eye(3))[own]
+    one = smoothed.take_rows(rows, used.columns)
+    S = (one.covariance + one.sigma[:, :, None] ** 2 * np.eye(3))[own]
     begin, end = gaps[np.searchsorted(gaps[:, 0], t[own]) - 1].T
     times, index = np.unique(np.concatenate([begin, t[own], end]), return_inverse=True)
     states, _ = make_dense(used, smoothed.states, smoothed.P[:, :DIM, :DIM], None, smooth=True)(times)

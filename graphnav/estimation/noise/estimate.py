@@ -18,7 +18,7 @@ is half as long: weights and figures may alternate between two states. The first
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +29,7 @@ from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.components import Components, Squares, begin_components
 from graphnav.estimation.noise.information import compute_information, compute_tail_information
-from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
+from graphnav.estimation.noise.initial_points import BREAKDOWN, Initial, find_initial_points
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import ImuMoments, Moments, collect_moments, lag_moments
 from graphnav.estimation.noise.outliers import compute_interval_cost, compute_row_costs, list_reduced
@@ -78,10 +78,10 @@ class NoiseEstimate:
         aiding = [x for name, x in figures if not name.startswith(("imu.", "prior."))]  # of offsets, no noise
         return max(((x.log_factor - x.prior) / x.prior_sigma for x in aiding), default=0.0)
 
-    def attracts(self, figures: Components, points: Points, log_evidence: float) -> bool:
+    def attracts(self, log_factors: Mapping[str, float], points: Points, log_evidence: float) -> bool:
         """Whether figures with no more evidence are within a sigma of its own, and points near its own."""
         own = self.noise.figures
-        within = all(abs(x - own[name].log_factor) <= own[name].sigma for name, x in figures.log.items())
+        within = all(abs(x - own[name].log_factor) <= own[name].sigma for name, x in log_factors.items())
         return within and log_evidence <= self.log_evidence and are_near(points, self.points, LINEAR_ATTITUDE)
 
     def get_linearisation(self, base: Problem) -> tuple[Points, Problem]:
@@ -123,14 +123,10 @@ def estimate_noise(
     if near is not None:
         about = reuse_points(*near, apply_noise(problem, figures.build_model()))
         return _iterate(problem, figures, about, progress, intervals, known)
-    used = apply_noise(problem, figures.build_model())
-    try:
-        initials, passes = find_initial_points(used, opening)
-    except BREAKDOWN:  # with the prior's medians; with stated noise it may not
-        initials, passes = find_initial_points(problem, opening)
-        initials = [replace(one, points=reuse_points(one.points, problem, used)) for one in initials]
-    found: list[NoiseEstimate] = []
-    for initial in initials:
+    found, passes, failure = list[NoiseEstimate](), Counter[str](), None
+    for initial in _list_initial_points(problem, apply_noise(problem, figures.build_model()), opening):
+        passes.update(filter=initial.passes, smoother=initial.passes)
+        best = max(found, key=lambda one: one.log_evidence, default=None)
         figures = begin_components(problem, start, scales)
         figures.weights |= initial.weights
         for name, more in initial.log_factors.items():
@@ -138,14 +134,32 @@ def estimate_noise(
         if start is None:
             figures.doubt_wheels(problem)
         try:
-            best = max(found, key=lambda one: one.log_evidence, default=None)
             found.append(_iterate(problem, figures, initial.points, progress, intervals, best))
-        except BREAKDOWN:  # from these points; others may succeed
-            if initial is initials[-1] and not found:
-                raise
+        except BREAKDOWN as error:  # from these points; others may succeed
+            failure = error
+            continue
+        if best is not None and _are_same(best, found[-1]):
+            break
+    if failure is not None and not found:
+        raise failure
     best = max(found, key=lambda one: one.log_evidence)
-    total = sum((one.passes for one in found), Counter(filter=passes, smoother=passes))
-    return replace(best, passes=total)
+    return replace(best, passes=sum((one.passes for one in found), passes))
+
+
+def _list_initial_points(problem: Problem, used: Problem, opening: float | None) -> Iterator[Initial]:
+    """Those of a problem with the figures to start from, or where its filter breaks down, with stated noise."""
+    try:
+        yield from find_initial_points(used, opening)
+    except BREAKDOWN:
+        for one in find_initial_points(problem, opening):
+            yield replace(one, points=reuse_points(one.points, problem, used))
+
+
+def _are_same(one: NoiseEstimate, other: NoiseEstimate) -> bool:
+    """Whether two estimates have come to the same maximum."""
+    worse, better = sorted((one, other), key=lambda each: each.log_evidence)
+    log_factors = {name: figure.log_factor for name, figure in worse.noise.figures.items()}
+    return better.attracts(log_factors, worse.points, worse.log_evidence)
 
 
 def _iterate(
@@ -186,7 +200,7 @@ def _iterate(
             if progress is not None:
                 progress("noise", 1.0 - np.log1p(expected) / np.log1p(most_expected))
             converged = near and abs(gained) < _SETTLED * _CHANCE_GAIN * len(figures.log)
-            converged |= known is not None and end == total and known.attracts(here, ahead, evidence)
+            converged |= known is not None and end == total and known.attracts(here.log, ahead, evidence)
             if converged or since == _UNSETTLED:
                 break
         figures = here if converged and end == total else figures if converged else likeliest
@@ -200,7 +214,7 @@ def _iterate(
     assert latest is not None
     figures.sigmas = figures.compute_sigmas(information)
     passes = Counter(filter=round(done / total), smoother=round(done / total))
-    return NoiseEstimate(figures.build_model(), latest[1].drop_rows(), prior_then, evidence, passes)
+    return NoiseEstimate(figures.build_model(), latest[1], prior_then, evidence, passes)
 
 
 def _average(problem: Problem, figures: Components, before: Components) -> None:

@@ -16,7 +16,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.estimation.faults.watch import FAULT_COST, LARGE, MINUTE, PATIENCE, SIZES
 from graphnav.estimation.noise.model import INTERVALS
-from graphnav.estimation.noise.moments import collect_row_moments, predict_errors
+from graphnav.estimation.noise.moments import compute_expected_squares, predict_errors
 from graphnav.estimation.noise.outliers import compute_row_costs
 from graphnav.estimation.noise.spans import Span, mask_times
 from graphnav.estimation.noise.tails import CHANCE, get_tail_index, weigh_outlying
@@ -128,7 +128,7 @@ def measure_sizes(base: Problem, problem: Problem, smoothed: MomentPass, spans: 
         if rows.name not in FIXES:
             continue
         t, most = problem.t[rows.keyframe], SIZES[rows.unit]
-        error, stated = predict_errors(problem, rows, smoothed)
+        error, stated = predict_errors(rows, smoothed)
         sigma[rows.name], cost[rows.name] = np.full(len(spans), most), np.zeros(len(spans))
         for k, span in enumerate(spans):
             own = mask_times(t, [span])
@@ -209,8 +209,9 @@ def compute_evidence(
     """Find the most probable explanation of each span, by the likelihood of the innovations.
 
     Measurements that have an error in common for longer than `watch.PATIENCE` may have outliers besides: where the
-    innovations show that these could decide, their weights are found by a smoother with that error; not if all that
-    they could gain would leave the log-probability below `least`.
+    innovations show that these could decide, their weights are found by a smoother with that error, by steps of
+    expectation-maximisation, none of which lowers the log-probability (Lange, Little and Taylor 1989); not if all that
+    they could gain would leave it below `least`.
 
     Spans are explained each by itself, up to the start of the next one. Where spans without a measurement between them
     have different explanations, the state at the second is not that of its model, so a filter with all that was chosen
@@ -312,10 +313,10 @@ class Trials:
             if rows.name in kinds:
                 t, m = problem.t[rows.keyframe], len(rows.axes)
                 index = get_tail_index(tails, rows.name, m)
-                left_out = collect_row_moments(common, wrong, smoothed, len(rows)).left_out
+                squared = compute_expected_squares(smoothed.take_rows(wrong))
                 weight = np.ones(len(rows)) if rows.weight is None else rows.weight
                 inside = [mask_times(t, [span]) & some for span, some in zip(self._spans, where, strict=True)]
-                weight = np.where(np.any(inside, axis=0), weigh_outlying(left_out, m, index), weight)
+                weight = np.where(np.any(inside, axis=0), weigh_outlying(squared, m, index), weight)
                 rows = replace(rows, weight=weight)
             weighted.append(rows)
         problem = replace(problem, constraints=tuple(weighted))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,29 +35,28 @@ class Initial:
     """Linearisation points of all keyframes, and what goes with them."""
 
     points: Points
+    passes: int  # of filter and smoother, to find them
     weights: dict[str, RowWeights] = field(default_factory=dict)  # by constraint, of the rows they do not rest on
     log_factors: dict[str, float] = field(default_factory=dict)  # of figures, beyond those of the problem
 
 
-def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[Initial], int]:
-    """Points of a filter that uses all measurements, and others if leaving gross outliers out leads elsewhere.
+def find_initial_points(problem: Problem, opening: float | None) -> Iterator[Initial]:
+    """Find points of a filter that uses all measurements, and others if leaving gross outliers out leads elsewhere.
 
     Gross outliers lead a filter that uses all measurements too far from the truth for linearisation. So they are left
     out, and searched again with the filter without them, until the same ones are found. Growing errors are not searched
     for: while the heading is still uncertain, the filter itself drifts against the fixes. If that leads elsewhere, or
-    the filter breaks down, points that rest on few outliers are found by annealing.
+    the filter breaks down, points that rest on few outliers are found by annealing, once they are asked for.
 
     Parameters
     ----------
     problem : with the figures to start from.
     opening : as for `graphnav.estimation.solvers.ekf.ekf`.
 
-    Returns
-    -------
-    list of Initial
-        Several where all have to be tried.
-    int
-        Passes of filter and smoother.
+    Yields
+    ------
+    Initial
+        Several until two of them lead to the same.
 
     Raises
     ------
@@ -65,8 +66,19 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
     try:
         plain = smooth_points(ekf(problem, opening=opening, stays=_SETTLED))
     except BREAKDOWN:  # outliers of hundreds of sigmas make its covariance numerically singular
-        initial, passes = anneal(problem, opening)
-        return [initial], passes
+        yield anneal(problem, opening)
+        return
+    initials, sure = _leave_out_gross(problem, opening, plain)
+    yield from initials
+    if not sure:
+        with contextlib.suppress(*BREAKDOWN):
+            yield anneal(problem, opening)
+
+
+def _leave_out_gross(problem: Problem, opening: float | None, plain: Points) -> tuple[list[Initial], bool]:
+    """The points of a filter that uses all measurements, those that leaving gross outliers out leads to if they differ,
+    and whether nothing else has to be tried.
+    """
     sound, about, passes = problem, plain, 1
     smoothed: SmootherPass | None = None
     try:
@@ -77,35 +89,25 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
             sound, smoothed = found, smooth_near(found, about, opening)
             about, passes = smoothed, passes + 2
         if smoothed is None:
-            return [Initial(plain)], passes
+            return [Initial(plain, passes)], True
         one, other = (smooth_points(refilter(problem, points, whole=False)) for points in (plain, about))
     except BREAKDOWN:  # with figures or points that are far off, most rows seem wrong
-        return _add_annealed([Initial(plain)], passes, problem, opening)
+        return [Initial(plain, passes)], False
     weights = {}
     for rows in sound.constraints:
         if rows.weight is not None and np.any(rows.weight == 0.0):
-            left_out, m = collect_row_moments(sound, rows, smoothed, len(rows)).left_out, len(rows.axes)
+            m, own = len(rows.axes), smoothed.take_rows(rows, sound.columns)
+            left_out = collect_row_moments(rows, own).left_out
             every = np.ones(len(rows), dtype=bool)
             weight = weigh_scaled(left_out, m, get_tail_index({}, rows.name, m), every)
             weights[rows.name] = list_reduced(sound.t[rows.keyframe], weight, every)
     if are_near(other, one):
-        return [Initial(one, weights)], passes + 2
-    return _add_annealed([Initial(plain), Initial(about, weights)], passes + 2, problem, opening)
+        return [Initial(one, passes + 2, weights)], True
+    return [Initial(plain, 1), Initial(smoothed.drop_covariances(), passes + 1, weights)], False
 
 
-def _add_annealed(
-    initials: list[Initial], passes: int, problem: Problem, opening: float | None
-) -> tuple[list[Initial], int]:
-    """The initial points with annealed ones, if these do not break down, and all passes."""
-    try:
-        annealed, more = anneal(problem, opening)
-    except BREAKDOWN:
-        return initials, passes
-    return [*initials, annealed], passes + more
-
-
-def anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
-    """Points and figures that are robust against outliers, by deterministic annealing, and the number of passes.
+def anneal(problem: Problem, opening: float | None) -> Initial:
+    """Find points and figures that are robust against outliers, by deterministic annealing.
 
     The errors of fixes are assumed to be as large as they get, then a third of that in each round, with weights by the
     residuals of the round before; until half of them are no smaller than assumed, or the stated sigmas are reached.
@@ -142,7 +144,7 @@ def anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
     larger = {
         group: -float(np.median(np.log(share[rows.name]))) for rows in fixes for group in rows.list_noise_groups()[0]
     }
-    return Initial(about, outliers, larger), passes
+    return Initial(about, passes, outliers, larger)
 
 
 def _list_unused(problem: Problem) -> dict[str, list[int]]:

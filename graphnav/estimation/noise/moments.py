@@ -9,7 +9,7 @@ with r and N of the disturbance smoother (Koopman 1993, "Disturbance smoother fo
 
     r = P-^-1 (x^s - x-)           N = P-^-1 (P- - P^s) P-^-1
 
-and at rows with residual e and Jacobian H at the smoothed state, r = R^-1 e and N = R^-1 - R^-1 H P^s H^T R^-1. B is
+and at rows with Jacobian H, and residual e of the smoothed state, r = R^-1 e and N = R^-1 - R^-1 H P^s H^T R^-1. B is
 the component's redundancy, its degrees of freedom in the data (Foerstner 1979; MacKay 1992 calls it the number of
 well-determined parameters), and E[A] = B where f is right.
 
@@ -30,8 +30,8 @@ from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import Rows, find_stepping, shift
-from graphnav.estimation.solvers.passes import MomentPass, SmootherPass
+from graphnav.estimation.solvers.linearise import find_stepping, shift
+from graphnav.estimation.solvers.passes import MomentPass, SmoothedRows
 
 Process = tuple[Array, Array, Array]  # keyframes (n,), A and B (n, k)
 
@@ -43,7 +43,7 @@ _FORGOTTEN = 1e-6  # relative remainder of a difference below which it is roundi
 
 @dataclass(frozen=True)
 class RowMoments:
-    """Rows of a constraint at a smoothed solution."""
+    """Rows of a constraint as a smoothed solution has them."""
 
     A: Array  # (N, m) w e^2 / R
     B: Array  # (N, m) redundancy
@@ -90,14 +90,10 @@ def collect_moments(problem: Problem, attitudes: Array, smoothed: MomentPass) ->
     n = len(attitudes)
     chains = [chain for chain in problem.chains if chain.parameter.noise_groups]
     grouped = [rows for rows in problem.constraints if rows.list_noise_groups()[0]]
-    counts = [int(np.searchsorted(rows.keyframe, n)) for rows in grouped]
     return Moments(
         collect_imu_moments(problem, attitudes[:-1], smoothed),
         {chain.parameter.name: collect_process_moments(problem, chain, smoothed, n) for chain in chains},
-        {
-            rows.name: collect_row_moments(problem, rows, smoothed, count)
-            for rows, count in zip(grouped, counts, strict=True)
-        },
+        {rows.name: collect_row_moments(rows, smoothed.take_rows(rows)) for rows in grouped},
     )
 
 
@@ -139,34 +135,38 @@ def collect_process_moments(problem: Problem, chain: ParameterChain, smoothed: M
     return k, q * smoothed.r[k, at] ** 2, q * np.maximum(N, 0.0)
 
 
-def predict_errors(problem: Problem, rows: Constraint, smoothed: MomentPass) -> tuple[Array, Array]:
+def predict_errors(rows: Constraint, smoothed: MomentPass) -> tuple[Array, Array]:
     """Errors (N, m) of the rows of a constraint, each number predicted by a smoother without it, and sigmas (N, m)."""
-    linear = smoothed.linearise(rows, problem.columns, len(rows))
-    return linear.residual / _compute_redundancies(linear, smoothed.cover_rows(linear, len(rows)))[1], linear.stated
+    one = smoothed.take_rows(rows)
+    return one.residual / _compute_redundancies(rows, one)[1], one.sigma
 
 
-def _compute_redundancies(linear: Rows, HPH: Array) -> tuple[Array, Array]:
-    """Weights (n, 1) of the first n rows, and redundancies (n, m) of their numbers; H P^s H^T is (n, m, m)."""
-    n, weight = len(HPH), linear.constraint.weight
-    w = np.ones((n, 1)) if weight is None else weight[:n, None]
-    return w, np.clip(1.0 - w * np.diagonal(HPH, axis1=1, axis2=2) / linear.stated**2, 1e-6, 1.0)
+def _compute_redundancies(rows: Constraint, one: SmoothedRows) -> tuple[Array, Array]:
+    """Weights (n, 1) of the first n rows, and redundancies (n, m) of their numbers."""
+    n = len(one.residual)
+    w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
+    return w, np.clip(1.0 - w * one.variance / one.sigma**2, 1e-6, 1.0)
 
 
-def collect_row_moments(problem: Problem, rows: Constraint, smoothed: MomentPass | SmootherPass, n: int) -> RowMoments:
+def compute_expected_squares(one: SmoothedRows) -> Array:
+    """(n,) E[|e / sigma|^2] of the errors of rows: their residuals', and what is uncertain of these."""
+    return np.asarray(np.sum((one.residual**2 + one.variance) / one.sigma**2, axis=1))
+
+
+def collect_row_moments(rows: Constraint, one: SmoothedRows) -> RowMoments:
     """Of the first n rows of a constraint."""
-    linear = smoothed.linearise(rows, problem.columns, n)
-    HPH = smoothed.cover_rows(linear, n)
-    R = linear.stated**2
-    w, B = _compute_redundancies(linear, HPH)
+    n = len(one.residual)
+    R = one.sigma**2
+    w, B = _compute_redundancies(rows, one)
     # in axes that diagonalise the whitened covariance: a stamp error affects all components together
-    each, axes = np.linalg.eigh(HPH / (linear.stated[:, :, None] * linear.stated[:, None]))
+    each, axes = np.linalg.eigh(one.covariance / (one.sigma[:, :, None] * one.sigma[:, None]))
     free = np.clip(1.0 - w * each, _CONTROLLED, 1.0)
-    predicted = np.einsum("nji,nj->ni", axes, linear.residual / linear.stated) / free
+    predicted = np.einsum("nji,nj->ni", axes, one.residual / one.sigma) / free
     left_out = np.sum(predicted**2 / (1.0 + np.maximum(each, 0.0) / free), axis=1)
     # of the component that a factor scales
     share = 1.0 if rows.unscaled is None else 1.0 - rows.unscaled[:n] ** 2 / R
-    A = share * w * linear.residual**2 / R
-    return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, share * linear.residual)
+    A = share * w * one.residual**2 / R
+    return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, share * one.residual)
 
 
 def lag_moments(problem: Problem, chain: ParameterChain, smoothed: MomentPass, moments: Process) -> tuple[Array, ...]:

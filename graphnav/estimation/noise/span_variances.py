@@ -74,7 +74,7 @@ def _measure_factors(
         if not spans:
             continue
         t = problem.t[rows.keyframe]
-        error, sigma = predict_errors(problem, rows, smoothed)
+        error, sigma = predict_errors(rows, smoothed)
         for span in spans:
             own = mask_times(t, [span])
             e = error[own]

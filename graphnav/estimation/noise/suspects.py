@@ -82,7 +82,7 @@ def predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:
     """Squared errors of all fixes, each predicted without itself."""
     fixes = (rows for rows in problem.constraints if rows.name in FIXES)
     return {
-        c.name: (problem.t[c.keyframe], collect_row_moments(problem, c, found.points, len(c)).left_out, len(c.axes))
+        c.name: (problem.t[c.keyframe], collect_row_moments(c, found.points.take_rows(c)).left_out, len(c.axes))
         for c in fixes
     }
 
@@ -93,7 +93,7 @@ def cut_at_steps(spans: list[Span], decided: NoiseModel, problem: Problem, found
     wrong = decided.excluded.get(FIXES[0], ())
     if rows is None or not wrong:
         return spans
-    error, sigma = predict_errors(problem, rows, found.points)
+    error, sigma = predict_errors(rows, found.points)
     cost = float(np.median(np.sum(np.log1p(SIZES[rows.unit] / sigma), axis=1)) + FAULT_COST)
     cut = split_at_steps([span for span in spans if span in wrong], problem.t[rows.keyframe], error, sigma, cost)
     return sorted([*cut, *(span for span in spans if span not in wrong)])

@@ -15,13 +15,27 @@ from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem, SolvedProblem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
-from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, scale_at, shift
+from graphnav.estimation.solvers.linearise import Columns, Points, find_last_keyframes, linearise, scale_at, shift
 from graphnav.estimation.solvers.recursion import Arrays, RowBlocks
 from graphnav.estimation.solvers.stack import Innovations
 from graphnav.imu.dynamics import convert_to_biases
 
 LINEAR_ATTITUDE = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
 _TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
+
+
+@dataclass(frozen=True)
+class SmoothedRows:
+    """The first n rows of a constraint as a smoothed solution has them."""
+
+    residual: Array  # (n, m)
+    sigma: Array  # (n, m) without the rows' weights
+    covariance: Array  # (n, m, m) H P^s H^T of the residuals
+
+    @property
+    def variance(self) -> Array:
+        """(n, m)"""
+        return np.diagonal(self.covariance, axis1=1, axis2=2)
 
 
 @dataclass(frozen=True)
@@ -39,45 +53,35 @@ class SmootherPass(Points):
         """The same without covariances, which are nearly all of its memory."""
         return replace(self, P=self.P[:0].copy())
 
-    def linearise(self, rows: Constraint, columns: Columns, n: int) -> Rows:
-        """The first n rows of a constraint, linearised at the smoothed points."""
-        return linearise(rows, self, columns, slice(0, n))
-
-    def cover_rows(self, linear: Rows, n: int) -> Array:
-        """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised at the smoothed points."""
-        return linear.H @ self.P[linear.constraint.keyframe[:n]] @ np.swapaxes(linear.H, 1, 2)
+    def take_rows(self, rows: Constraint, columns: Columns) -> SmoothedRows:
+        """Rows of a constraint, linearised at the smoothed points."""
+        linear = linearise(rows, self, columns)
+        covariance = linear.H @ self.P[rows.keyframe] @ np.swapaxes(linear.H, 1, 2)
+        return SmoothedRows(linear.residual, linear.stated, covariance)
 
 
 @dataclass(frozen=True)
 class MomentPass(Points):
     """A backward pass with what it says of the disturbances before each of n keyframes, linearised at given points.
 
-    P^s = P- - P- N P-. Of covariances it has only those that noise estimation needs, at half the cost.
+    P^s = P- - P- N P-. Of covariances it has only those that noise estimation needs, at half the cost. Residuals are
+    linear, so that squares are those of the likelihood that the forward pass has found.
     """
 
     r: Array  # (n, D)
     N: Array  # (n, 15, 15) of the states
     N_diagonal: Array  # (n, D)
     variance: Array  # (n, D) of the errors, of parameters with a correlation time
-    of_rows: Array  # (n, M, M) H P^s H^T, where each of these stands
-    places: dict[str, tuple[Array, Array]]
-    linear: dict[str, Rows]  # at these points, as long as they are kept
+    residual: Array  # (n, M) of rows
+    sigma: Array  # (n, M) as stated
+    of_rows: Array  # (n, M, M) H P^s H^T
+    places: dict[str, tuple[Array, Array]]  # of each constraint's rows, as of `Updates`
 
-    def drop_rows(self) -> MomentPass:
-        """The same without the linearised rows, which are most of its memory."""
-        return replace(self, linear={})
-
-    def linearise(self, rows: Constraint, columns: Columns, n: int) -> Rows:
-        """As of `SmootherPass`."""
-        kept = self.linear.get(rows.name)
-        if kept is not None and kept.constraint is rows and len(kept.residual) == n:
-            return kept
-        return linearise(rows, self, columns, slice(0, n))
-
-    def cover_rows(self, linear: Rows, n: int) -> Array:
-        """As of `SmootherPass`."""
-        k, place = self.places[linear.constraint.name]
-        return self.of_rows[k[:n, :, None], place[:n, :, None], place[:n, None]]
+    def take_rows(self, rows: Constraint) -> SmoothedRows:
+        """Those of a constraint of the problem that was smoothed."""
+        k, place = self.places[rows.name]
+        covariance = self.of_rows[k[:, :, None], place[:, :, None], place[:, None]]
+        return SmoothedRows(self.residual[k, place], self.sigma[k, place], covariance)
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,8 @@ class Updates:
 
     blocks: RowBlocks
     Kt: Array  # (n, M, D) gains transposed
+    residual: Array  # (n, M) at the points
+    sigma: Array  # (n, M) as stated
     H: Array  # (n, M, D)
     w: Array  # (n, M) S^-1 nu
     inverse: Array  # (n, M, M) S^-1
@@ -103,13 +109,15 @@ class Updates:
 
     @classmethod
     def allocate(
-        cls, blocks: RowBlocks, H: Array, places: dict[str, tuple[Array, Array]], whole: bool = True
+        cls, blocks: RowBlocks, rows: Arrays, places: dict[str, tuple[Array, Array]], whole: bool = True
     ) -> Updates:
-        """None yet, of rows H (n, M, D); without gains if not `whole`."""
+        """None yet, of rows with residuals, sigmas (n, M) and H (n, M, D); without gains if not `whole`."""
+        residual, sigma, H = rows
         n, M, D = H.shape
         n *= whole
         taken, lossy = np.zeros((2, len(blocks.begin)), dtype=bool)
-        return cls(blocks, np.empty((n, M, D)), H, np.empty((n, M)), np.empty((n, M, M)), taken, lossy, places)
+        gains, w, inverse = np.empty((n, M, D)), np.empty((n, M)), np.empty((n, M, M))
+        return cls(blocks, gains, residual, sigma, H, w, inverse, taken, lossy, places)
 
 
 @dataclass(frozen=True)

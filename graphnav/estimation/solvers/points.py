@@ -106,7 +106,7 @@ class PointFilter:
         self.r, self._sigma, self.H = one.r, one.sigma, one.H
         self.variance = (self._sigma / stack.root_weight[:n]) ** 2
         self.used = stack.joint.used.copy()
-        self.updates = Updates.allocate(stack.joint, self.H, stack.places, whole)
+        self.updates = Updates.allocate(stack.joint, (one.r, one.sigma, one.H), stack.places, whole)
         self._at = np.zeros(1, dtype=int)
 
     def weigh(self, some: RowBlock, used: bool, root_weight: float | Array) -> None:

@@ -23,13 +23,13 @@ from scipy.linalg.lapack import dposv
 
 from graphnav.core import rotation
 from graphnav.core.progress import Progress
-from graphnav.core.rotation import Array
+from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.disturbance import smooth_rows
-from graphnav.estimation.solvers.linearise import Points, find_stepping, linearise
+from graphnav.estimation.solvers.linearise import Points, find_stepping
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
@@ -90,21 +90,18 @@ def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
     """Smooth a forward pass that was linearised at given points throughout, with covariances for a noise model only."""
     K, D = forward.P.shape[:2]
     assert forward.updates is not None
-    one, smoothed = forward.updates, smooth_points(forward)
-    asked, linear = np.zeros_like(one.H), {}
-    for rows in problem.constraints:
-        if rows.list_noise_groups()[0]:
-            which = slice(0, int(np.searchsorted(rows.keyframe, K)))
-            linear[rows.name] = linearise(rows, smoothed, problem.columns, which)
-            asked[one.places[rows.name]] = linear[rows.name].H
+    one = forward.updates
     wanted = np.zeros((K, D), dtype=bool)  # at both ends of their steps
     for chain in problem.chains:
         if chain.parameter.correlation_time is not None:
             k, own = find_stepping(chain, K), problem.columns[chain.parameter.name]
             wanted[k, own] = wanted[k - 1, own] = True
     none = np.zeros(D), np.zeros((D, D)), np.empty((0, D, D))
-    _, r, N, N_diagonal, variance, of_rows = _smooth_given(forward, one, K, *none, wanted, asked)
-    return MomentPass(smoothed.states, smoothed.values, r, N, N_diagonal, variance, of_rows, one.places, linear)
+    errors, r, N, N_diagonal, variance, of_rows = _smooth_given(forward, one, K, *none, wanted, one.H)
+    smoothed, residual = move_points(forward.about, errors), one.residual + mv(one.H, errors)
+    return MomentPass(
+        smoothed.states, smoothed.values, r, N, N_diagonal, variance, residual, one.sigma, of_rows, one.places
+    )
 
 
 def _smooth_filtered(
