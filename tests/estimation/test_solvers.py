@@ -515,3 +515,20 @@ def test_a_scale_that_multiplies_what_is_known_later() -> None:
     smoothed, best = run(drive, solvers=("rts", "batch")).values()
     assert np.abs((smoothed.states.p - best.states.p)[:, 2]).max() < 0.1
     np.testing.assert_allclose(sigmas(smoothed)[:, 5], sigmas(best)[:, 5], rtol=0.05)
+
+
+def test_no_step_of_batch_raises_the_cost_about_the_biases_to_which_it_leads() -> None:
+    """Fixes frozen for twelve seconds of driving bend the biases far beyond the first-order correction."""
+    drive = read(Path(__file__).resolve().parents[2] / "data" / "tokyo").crop(0.0, 40.0)
+    assert drive.gnss is not None
+    llh = drive.gnss.llh.copy()
+    frozen = (drive.gnss.t > drive.start + 10.0) & (drive.gnss.t < drive.start + 22.0)
+    llh[frozen] = llh[np.flatnonzero(frozen)[0]]
+    settings = {"noise": {"mode": "stated"}, "gnss": {"faults": "off"}, "solver": {"max_iterations": 8}}
+    still = replace(drive, gnss=replace(drive.gnss, llh=llh))
+    (one,) = run(still, parse_settings(settings), ("rts",))["rts"].graphs
+    costs: list[float] = []
+    found = batch(one.problem, one.states, one.values, watch=lambda states, cost, gain, slow: costs.append(cost))
+    assert found.cost is not None
+    assert len(costs) > 2
+    assert np.all(np.diff([*costs, found.cost]) <= 0.0)

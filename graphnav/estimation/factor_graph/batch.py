@@ -168,6 +168,11 @@ def _minimise(
                 break
             if damping == 0.0:
                 ahead, shortened = _improve(problem, here, step, gain, ahead, layout)
+            if reintegrate and ahead.cost < here.cost:
+                # biases that move far are linear no longer: about these, the cost may be higher
+                ahead, about, again = _integrate(problem, ahead, layout)
+                if ahead.cost < here.cost:
+                    (problem, layout), renewed = about, renewed + again
             if ahead.cost < here.cost:
                 break
             refused += 1
@@ -190,13 +195,6 @@ def _minimise(
         if damping == gentlest:
             gentlest /= 10.0  # a larger step would have been possible: less damping in a long valley
         damping = 0.0 if damping <= _MIN_DAMPING or gain < settings.tolerance else damping / 10.0
-        if reintegrate:
-            scale = scale_at(problem.columns, here.points.values[0])
-            problem, again = integrate_again(problem, here.points.states, scale)
-            if again:
-                layout = Layout(problem)
-                here = _evaluate(problem, here.points, layout)
-                renewed += again
     if eliminated is None and iterations is None:
         eliminated = solve_rows(here.rows, layout)[0]
     notes = []
@@ -214,6 +212,18 @@ def _minimise(
 
 def _evaluate(problem: Problem, points: Points, layout: Layout) -> _Candidate:
     return _Candidate(points, *whiten(problem, points, layout))
+
+
+def _integrate(problem: Problem, here: _Candidate, layout: Layout) -> tuple[_Candidate, tuple[Problem, Layout], int]:
+    """A candidate with intervals integrated about its own biases where these have moved far, the problem and layout
+    that it is then of, and how many intervals.
+    """
+    scale = scale_at(problem.columns, here.points.values[0])
+    again, count = integrate_again(problem, here.points.states, scale)
+    if not count:
+        return here, (problem, layout), 0
+    layout = Layout(again)
+    return _evaluate(again, here.points, layout), (again, layout), count
 
 
 def _improve(
