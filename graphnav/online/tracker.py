@@ -279,10 +279,7 @@ class Tracker(Chain):
             return  # relinearisation is in progress: the next keyframe will do
         if last:
             count = len(self.window)
-        elif (
-            not self.window.smooth_back(count, min(_SMOOTHED * self.at_a_row, self.window.smoothed))
-            and overdue < self.settings.solver.lag
-        ):
+        elif not self.window.smooth_back(count, _SMOOTHED * self.at_a_row) and overdue < self.settings.solver.lag:
             return  # some more rows
         self.settled.append(self._leave(count))
         self._ahead = None  # settled states may show that sigmas have changed

@@ -247,6 +247,7 @@ class Window:
         Keyframes that arrive meanwhile do not count; when some are removed, it starts again. To begin is a portion,
         where one is not all.
         """
+        most = min(most, self.smoothed)
         if self._leaving is None:
             self._leaving = self._begin_leaving(count)
             if most < len(self):

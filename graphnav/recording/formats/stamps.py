@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
@@ -104,12 +105,11 @@ def find_set_back(t: Array, p: Array) -> tuple[int, float] | None:
     if len(t) < 2 * RUN + 2 or not (steps > 0.0).any():
         return None
     period = float(np.median(steps[steps > 0.0]))
-    for k in np.flatnonzero(steps < 0.5 * period).tolist():
-        if k < RUN or k + 1 + RUN >= len(t):
-            continue
+    even = sliding_window_view(np.abs(steps - period) <= _UNEVEN * period, RUN).all(axis=1)
+    inner = np.arange(RUN, len(steps) - RUN)
+    broken = (steps[inner] < 0.5 * period) & even[inner - RUN] & even[inner + 1]
+    for k in inner[broken].tolist():
         runs = slice(k - RUN, k + 1), slice(k + 1, k + 2 + RUN)
-        if any(np.abs(np.diff(t[run]) - period).max() > _UNEVEN * period for run in runs):
-            continue
         before, after = (np.diff(p[run], axis=0) for run in runs)
         usual, jump = 0.5 * (before[-1] + after[0]), period - steps[k]
         bends = [some[1:-1] - 0.5 * (some[:-2] + some[2:]) for some in (before, after)]
