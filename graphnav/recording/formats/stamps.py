@@ -105,7 +105,7 @@ def find_set_back(t: Array, p: Array) -> tuple[int, float] | None:
     if len(t) < 2 * RUN + 2 or not (steps > 0.0).any():
         return None
     period = float(np.median(steps[steps > 0.0]))
-    even = sliding_window_view(np.abs(steps - period) <= _UNEVEN * period, RUN).all(axis=1)
+    even = np.all(sliding_window_view(np.abs(steps - period) <= _UNEVEN * period, RUN), axis=1)
     inner = np.arange(RUN, len(steps) - RUN)
     broken = (steps[inner] < 0.5 * period) & even[inner - RUN] & even[inner + 1]
     for k in inner[broken].tolist():
