@@ -7,8 +7,8 @@ Decision. With the noise model as it is, each span is explained by several model
 innovations from the start of the span to the start of the next one:
 
     none        nothing is wrong: errors have the tails that they have elsewhere
-    fixes       positions, velocities or both have one unknown error in common, which may grow linearly, or an unknown
-                error each; beside a common error that lasts for more than `watch.PATIENCE`, single ones may be outliers
+    fixes       positions, velocities or both have one unknown error in common, which may grow linearly, beside which
+                single ones may be outliers, or an unknown error each
     wheels      the non-holonomic constraint and the odometer have one such error in common
     IMU         single intervals have more noise, those that the smoother needs it for
 
@@ -25,12 +25,12 @@ comes up on the way is decided by these figures, and the decision with the large
 once more, as the spans shrink to what is wrong, unless the figures lose more evidence inside them than they
 gain outside. If no fault is left, the estimate that uses all measurements and starts from these figures is a candidate.
 
-Segments. A filter follows an error that lasts for more than `watch.PATIENCE`, so the tests find its beginning, and its
-end as the beginning of another. So the ends of all suspected spans divide the drive into segments, and those that are
-wrong together by the evidence (`graphnav.estimation.faults.segments`) are one more set of spans, if one of them is
-such an error. Two disturbances of the IMU make the fixes between them look displaced as well. So where segments are the
-likeliest, the likeliest of the other sets is estimated too, and stands unless segments are likelier in the end by more
-than figures gain by chance.
+Segments. A filter follows an error that lasts, so the tests find its beginning, and its end as the beginning of
+another. So the ends of all suspected spans divide the drive into segments, and those that are wrong together by the
+evidence (`graphnav.estimation.faults.segments`) are one more set of spans, if one of them was not suspected. Two
+disturbances of the IMU make the fixes between them look displaced as well. So where segments are the likeliest, the
+likeliest of the other sets is estimated too, and stands unless segments are likelier in the end by more than figures
+gain by chance.
 
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,

@@ -14,7 +14,7 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
-from graphnav.estimation.faults.watch import FAULT_COST, LARGE, MINUTE, PATIENCE, SIZES
+from graphnav.estimation.faults.watch import FAULT_COST, LARGE, MINUTE, SIZES
 from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.noise.moments import compute_expected_squares, predict_errors
 from graphnav.estimation.noise.outliers import compute_row_costs
@@ -23,7 +23,7 @@ from graphnav.estimation.noise.tails import CHANCE, get_tail_index, weigh_outlyi
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import Comparison, refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import MomentPass, make_points, split_values
+from graphnav.estimation.solvers.passes import ForwardRecord, MomentPass, make_points, split_values
 from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.recording import Recording
@@ -208,10 +208,10 @@ def compute_evidence(
 ) -> tuple[float, list[Explanation], int]:
     """Find the most probable explanation of each span, by the likelihood of the innovations.
 
-    Measurements that have an error in common for longer than `watch.PATIENCE` may have outliers besides: where the
-    innovations show that these could decide, their weights are found by a smoother with that error, by steps of
-    expectation-maximisation, none of which lowers the log-probability (Lange, Little and Taylor 1989); not if all that
-    they could gain would leave it below `least`.
+    Measurements that have an error in common may have outliers besides: where the innovations show that these could
+    decide, their weights are found by a smoother with that error, by steps of expectation-maximisation, none of which
+    lowers the log-probability (Lange, Little and Taylor 1989); not if all that they could gain would leave it below
+    `least`.
 
     Spans are explained each by itself, up to the start of the next one. Where spans without a measurement between them
     have different explanations, the state at the second is not that of its model, so a filter with all that was chosen
@@ -237,7 +237,6 @@ def compute_evidence(
         Filter passes.
     """
     trials = Trials(problem, about, spans)
-    lasting = np.array([end - begin > PATIENCE for begin, end in spans])
     models: list[_Model] = []
     common: list[tuple[_Model, Array]] = []
     before = 0.0
@@ -254,20 +253,21 @@ def compute_evidence(
             continue
         stack = trials.filter(add_common_errors(base, spans, kinds), kinds)
         models.append(_Model(kinds, base, kinds, trials.sum_spans(stack.log_likelihood()), cost))
-        if lasting.any():
-            gain = trials.sum_spans(_bound_gain(stack, kinds, costs.tails))
-            common.append((models[-1], np.where(lasting, gain, 0.0)))
+        common.append((models[-1], trials.sum_spans(_bound_gain(stack, kinds, costs.tails))))
         if set(kinds) <= set(FIXES):
             one = add_own_errors(base, spans, kinds, sizes)
             more = np.sum([sizes.cost[name] for name in kinds], axis=0)
             models.append(_Model(kinds, one, (), trials.sum_spans(trials.filter(one).log_likelihood()), cost + more))
     highest = np.max([one.value for one in models] + [model.value + gain for model, gain in common], axis=0)
     for model, gain in common if before + float(np.sum(highest)) > least else ():
+        forward: ForwardRecord | None = None
         while np.any((gain > FAULT_COST) & (model.value + gain > np.max([one.value for one in models], axis=0))):
-            base, more = trials.weigh_outliers(model.problem, model.kinds, lasting, costs.tails)
-            likelihood = trials.filter(add_common_errors(base, spans, model.kinds), model.kinds).log_likelihood()
+            forward = forward or trials.filter_about(model.problem, model.kinds)
+            base, more = trials.weigh_outliers(model.problem, model.kinds, forward, costs.tails)
+            forward = trials.filter_about(base, model.kinds)
             cost = costs.explanations[:, EXPLANATIONS.index(model.kinds)] + more
-            previous, model = model, _Model(model.kinds, base, model.common, trials.sum_spans(likelihood), cost)
+            likelihood = trials.sum_spans(forward.log_likelihood)
+            previous, model = model, _Model(model.kinds, base, model.common, likelihood, cost)
             gain = model.value - previous.value  # less each time
             models.append(model)
     value, chosen = trials.choose(models)
@@ -298,32 +298,34 @@ class Trials:
         """(M,) sums of what keyframes (K,) have, from the start of each span to the start of the next."""
         return np.array([float(np.sum(each[a:b])) for a, b in itertools.pairwise(self.edges)])
 
+    def filter_about(self, problem: Problem, kinds: Explanation) -> ForwardRecord:
+        """The filter of a problem with an error in common of some constraints, for a smoother."""
+        self.passes += 1
+        common = add_common_errors(problem, self._spans, kinds)
+        return refilter(common, self._make_points(common), whole=False)
+
     def weigh_outliers(
-        self, problem: Problem, kinds: Explanation, where: Array, tails: Mapping[str, float]
+        self, problem: Problem, kinds: Explanation, forward: ForwardRecord, tails: Mapping[str, float]
     ) -> tuple[Problem, Array]:
         """The problem with weights for outliers among rows of some constraints, and what these cost in each span (M,).
 
-        `where` : (M,) in which spans.
+        `forward` : of `filter_about`.
         """
-        self.passes += 1
         common = add_common_errors(problem, self._spans, kinds)
-        smoothed = smooth_moments(common, refilter(common, self._make_points(common), whole=False))
-        weighted = []
+        smoothed, weighted = smooth_moments(common, forward), []
         for rows, wrong in zip(problem.constraints, common.constraints, strict=True):
             if rows.name in kinds:
                 t, m = problem.t[rows.keyframe], len(rows.axes)
                 index = get_tail_index(tails, rows.name, m)
                 squared = compute_expected_squares(smoothed.take_rows(wrong))
                 weight = np.ones(len(rows)) if rows.weight is None else rows.weight
-                inside = [mask_times(t, [span]) & some for span, some in zip(self._spans, where, strict=True)]
-                weight = np.where(np.any(inside, axis=0), weigh_outlying(squared, m, index), weight)
+                weight = np.where(mask_times(t, self._spans), weigh_outlying(squared, m, index), weight)
                 rows = replace(rows, weight=weight)
             weighted.append(rows)
         problem = replace(problem, constraints=tuple(weighted))
         others = [rows.name for rows in problem.constraints if rows.name not in kinds]
         each = compute_row_costs(problem, tails, without=others)
-        spans = zip(self._spans, where, strict=True)
-        return problem, np.array([np.sum(each[mask_times(problem.t, [span])]) if some else 0.0 for span, some in spans])
+        return problem, np.array([np.sum(each[mask_times(problem.t, [span])]) for span in self._spans])
 
     def choose(self, models: list[_Model]) -> tuple[float, list[Explanation]]:
         """The most probable explanation of each span, and the log-probability of all together, up to a constant."""
@@ -373,12 +375,12 @@ class Trials:
 def _bound_gain(stack: Stack, kinds: Explanation, tails: Mapping[str, float]) -> Array:
     """(K,) by which the log-probability rises at each keyframe if what exceeds the limit of chance is due to outliers.
 
-    Of successive keyframes that exceed it, the first has the outlier, and the others may be what it did to the state.
-    Its density is that of tails instead of a Gaussian.
+    Of successive keyframes that exceed it, the first has the outlier, and the others may be what it did to the state:
+    without it, they have the squares that are expected. Its density is that of tails instead of a Gaussian.
     """
     squared, count = stack.sum_squares()
     limit = chdtri(np.maximum(count, 1), CHANCE)
-    gain = 0.5 * np.maximum(squared - limit, 0.0)
+    gain = np.where(squared > limit, 0.5 * (squared - count), 0.0)
     places = {name: stack.places[name] for name in kinds if name in stack.places}
     measured = np.isin(np.arange(stack.K), np.concatenate([k[:, 0] for k, _ in places.values()]))
     least = min(get_tail_index(tails, name, p.shape[1]) + p.shape[1] for name, (_, p) in places.items())

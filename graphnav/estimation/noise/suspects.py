@@ -48,7 +48,7 @@ def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> lis
 def find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) -> tuple[list[Span], int]:
     """Wrong segments, of those into which the ends of suspected spans divide the drive, and filter passes that it took.
 
-    None unless one of them outlasts the tests, of which the spans are otherwise.
+    None unless some of them are in none of these spans.
     """
     within = join(suspected)
     if len(within) < 2:
@@ -58,8 +58,7 @@ def find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) ->
     edges = sorted({*(begin for begin, _ in suspected), *t[behind[behind < len(t)]].tolist()})
     used = apply_noise(base, replace(found.noise, excluded={}))
     segments = find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
-    outlasting = (one for one in segments if one[1] - one[0] > PATIENCE and not are_covered([one], within))
-    return segments if any(outlasting) else [], 1
+    return [] if are_covered(segments, within) else segments, 1
 
 
 def date_segments(base: Problem, found: NoiseEstimate, spans: list[Span]) -> list[Span]:
