@@ -132,24 +132,35 @@ def test_positions_that_are_not_read_do_not_make_a_walk(plain, tmp_path, capsys,
     assert name in refuse_command(capsys, "draft.positions_unread", "init", folder, "-o", folder, "--force")
 
 
-@pytest.mark.parametrize(
-    ("name", "change", "key"),
-    [
-        ("imu", lambda t, *x: [f"{np.floor(float(t) * 5.0) / 5.0 + 1e-2 * (float(t) % 0.2):.6f}", *x], "imu.bursts"),
-        ("gnss", lambda t, lat, lon, h: [t, lat, lon, f"{1e3 * float(h)}"], "table.height"),
-    ],
-)
-def test_a_draft_that_info_would_refuse_is_written_and_says_so(plain, tmp_path, capsys, name, change, key):
-    tables = {sensor: (header, rows) for sensor, (header, rows) in zip(("imu", "gnss"), plain, strict=True)}
-    header, rows = tables[name]
-    tables[name] = header, [change(*row) for row in rows]
-    folder = stranger.write_tables(tmp_path, *tables.values())
+def test_a_draft_that_info_would_refuse_is_written_and_says_so(plain, tmp_path, capsys):
+    imu, (header, rows) = plain
+    fixes = header, [[t, lat, lon, f"{1e3 * float(h)}"] for t, lat, lon, h in rows]
+    folder = stranger.write_tables(tmp_path, imu, fixes)
     assert cli.run(["init", str(folder), "-o", str(folder), "--json"]) == 3
     out, said = capsys.readouterr()
-    assert json.loads(out)["refused"]["key"] == key
+    assert json.loads(out)["refused"]["key"] == "table.height"
     assert said.startswith("graphnav: ")
     assert said.count("\n") == 1
     assert (folder / "recording.toml").exists()
+
+
+@pytest.mark.parametrize("step", [0.2, 0.9])
+@pytest.mark.parametrize("apart", [0.0, 1e-4])
+def test_rows_that_a_program_stamps_in_packets(plain, tmp_path, step, apart):
+    """Several rows read at once, with one stamp or with ones that are a moment apart."""
+    (header, rows), fixes = plain
+    t = np.array([float(row[0]) for row in rows])
+    packet = np.floor((t - t[0]) / step + 1e-6)
+    place = np.arange(len(t)) - np.searchsorted(packet, packet)
+    stamped = t[0] + packet * step + apart * place
+    packed = [[f"{s:.6f}", *row[1:]] for s, row in zip(stamped, rows, strict=True)]
+    folder = stranger.write_tables(tmp_path, (header, packed), fixes)
+    assert cli.run(["init", str(folder), "-o", str(folder), "--quiet"]) == 0
+    recording = read(folder)
+    assert "imu.packets" in {remark.key for remark in recording.remarks}
+    late = (recording.imu.t - t)[packet < packet[-1]]  # the last packet is not whole
+    assert np.ptp(late) < 1.1 * np.median(np.diff(t)) + 2.0 * apart * place.max()
+    assert np.abs(late).max() < step
 
 
 def test_rates_in_counts_are_not_drafted(plain, tmp_path, capsys):

@@ -40,4 +40,4 @@ def test_stamps_of_single_precision_are_told(tmp_path):
     lines[1].write_text("\n".join([*rows[: head + 1], *rounded]) + "\n")
     text = (tmp_path / "recording.toml").read_text().replace("imu.csv.gz", "imu.csv")
     (tmp_path / "recording.toml").write_text(text)
-    assert_told(read(tmp_path).remarks, "imu.rows_repeated", "single-precision", "0.03125")
+    assert_told(read(tmp_path).remarks, "imu.packets", "single-precision", "0.03125")

@@ -32,7 +32,7 @@ from graphnav.recording.formats.places import check_angles, find_places
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.repair import blank_unknown, mask_new_fixes
 from graphnav.recording.formats.schema import WHEELS
-from graphnav.recording.formats.stamps import find_repeated
+from graphnav.recording.formats.stamps import find_repeated, find_repeats, spread_packets
 from graphnav.recording.formats.table import Table, read_column_names, read_first_rows, read_table
 from graphnav.sensors.tables import ANGLE, TIME_UNITS
 
@@ -353,17 +353,19 @@ def read_sensor(
         values["t"], plain = seconds, Plain({}, words)
     inertial = role not in (*PLACED, "odometer", "barometer")
     unit = clock or guesses.guess_time_unit(values["t"], matching.find_stated_unit(columns, "t", "t"), inertial)
-    if (later := find_restarts(values["t"], TIME_UNITS[str(unit.value)])) is not None:  # as it will be read
+    if (later := find_restarts(values["t"], scale := TIME_UNITS[str(unit.value)])) is not None:  # as it will be read
         values["t"] = values["t"] + later
     order = np.argsort(values["t"], kind="stable")
-    repeated = find_repeated(f"{path}, column '{names['t']}'", values["t"][order])
-    order = order[~repeated]
-    if len(order) < 2:
+    values = {ours: v[order] for ours, v in values.items()}
+    if inertial and (spread := spread_packets(scale * values["t"], find_repeats(values))) is not None:
+        values["t"] = spread[0] / scale  # as it will be read
+    repeated = find_repeated(f"{path}, column '{names['t']}'", values["t"])
+    if np.count_nonzero(~repeated) < 2:
         raise RecordingError(
             f"{path}, column '{names['t']}': every row has the time {values['t'][0]:.10g}; log it with milliseconds",
             key="table.times_repeated",
         )
-    values = {ours: v[order] for ours, v in values.items()}
+    values = {ours: v[~repeated] for ours, v in values.items()}
     if role == "gnss":
         new = mask_new_fixes(values)  # as it will be read
         values = {ours: v[new] for ours, v in values.items()}
@@ -392,8 +394,7 @@ def read_sensor(
     if week is None and "gps" in names["t"].lower() and _are_gps_seconds(values["t"] * TIME_UNITS[str(unit.value)]):
         week, unit = 0, replace(unit, why=f"as s since the GPS epoch '{names['t']}' is then a date in the past")
     if plain is not None:  # what is written is whole, so nobody tells later
-        gone = ((~whole, "without all of its numbers"), (repeated, "with the time of another"))
-        for some, what in gone:
+        for some, what in ((~whole, "without all of its numbers"), (repeated, "with the time of another")):
             if some.any():
                 plain = add_words(plain, f"{some.sum()} of {len(some)} rows {what} left out")
     return Source(path, matching.FileColumns(names, columns.units), values, t_unit=unit, week=week, plain=plain)

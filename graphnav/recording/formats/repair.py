@@ -19,7 +19,9 @@ from graphnav.recording.formats.stamps import (
     check_passes,
     find_lone_stamps,
     find_repeated,
+    find_repeats,
     format_row_count,
+    spread_packets,
     take_halfway,
     tell_rounding,
 )
@@ -126,6 +128,14 @@ def select_usable_rows(
         )
         rows = rows.take(np.argsort(t, kind="stable"))
         t = rows["t"]
+    if sensor == "imu" and (spread := spread_packets(t, find_repeats(rows.columns))) is not None:
+        remarks.add(
+            "imu.packets",
+            f"{spread[1]:.3g} IMU rows in the mean have one stamp, or nearly, as a program reads them at once: taken "
+            f"to be evenly between these{tell_rounding(stamps, np.r_[False, step == 0.0])}",
+        )
+        t = spread[0]
+        rows = rows.with_column("t", t)
     repeated = find_repeated(f"{rows.path}, column '{rows.file_names['t']}'", t)
     if repeated.any():
         remarks.add(
@@ -149,10 +159,7 @@ def mask_new_fixes(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
     In such a log most fixes, between two that differ, fill two rows or more, identical except for their time. A
     standing receiver that rounds repeats itself too, but not between two fixes in motion.
     """
-    others = [x for name, x in columns.items() if name != "t"]
-    same = np.ones(max(len(columns["t"]) - 1, 0), dtype=bool)
-    for x in others:
-        same &= (x[1:] == x[:-1]) | (np.isnan(x[1:]) & np.isnan(x[:-1]))
+    same = find_repeats(columns)
     changes = np.flatnonzero(~same) + 1
     held = len(changes) > 2 and float(np.median(np.diff(changes))) >= 2.0
     return np.r_[True, ~same] if held else np.ones(len(columns["t"]), dtype=bool)

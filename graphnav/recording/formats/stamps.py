@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
@@ -18,8 +20,10 @@ _LONGEST_STEP = 10.0  # s between rows of a sensor
 _FAR = 10.0  # periods; rows that overtake each other are closer
 _SET_BACK = 3.0  # periods, of a clock; times are then there twice, and not only out of order
 _TWICE = 1.5  # rows to a period above which, between one and two, a time is there twice
-_PAUSE = 1.0  # s; longer steps of an IMU are gaps
-_BURST = 0.3  # ratio of median to mean step below which rows come in bursts
+_CLOSE = 0.3  # of the mean step, below which two rows were read at once
+_SPAN = 200  # rows over which their mean step is measured, more than a packet has
+_GAP = 2.0  # median times between packets, from which on rows are lost
+_PACKETS = 1 / 3  # share of such steps from which on rows come in packets: of one and two in turn, or more
 _ROUNDED_AWAY = 0.05  # share of the stamps that repeat the one before, where a rounding makes them
 _REPEATED = 0.6  # share of rows with the stamp of the previous row above which the log is refused
 _ROOM = 1.5, 3.0  # periods between two rows that leave room for one between them
@@ -53,6 +57,48 @@ def find_repeated(where: str, t: Array) -> NDArray[np.bool_]:
             key="table.times_repeated",
         )
     return repeated
+
+
+def find_repeats(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
+    """(N-1,) whether a row holds the same as the one before, apart from its time."""
+    same = np.ones(max(len(columns["t"]) - 1, 0), dtype=bool)
+    for x in (column for name, column in columns.items() if name != "t"):
+        same &= (x[1:] == x[:-1]) | (np.isnan(x[1:]) & np.isnan(x[:-1]))
+    return same
+
+
+def spread_packets(t: Array, repeats: NDArray[np.bool_]) -> tuple[Array, float] | None:
+    """Times (N,), s, of rows that a program has stamped in packets, as it read them, and how many a packet has in the
+    mean; None where it has not, and for whole seconds, of which the fraction was lost.
+
+    The last row of a packet keeps its stamp; the others are evenly between it and that of the packet before, or where
+    rows are lost, by the mean step before it.
+
+    Parameters
+    ----------
+    t : (N,) s, in order.
+    repeats : (N-1,) whether a row holds what the one before does, which is then no measurement of its own.
+    """
+    n = len(t)
+    if n < 2 or np.array_equal(t, np.floor(t)):
+        return None
+    span = min(_SPAN, n - 1)
+    usual = float(np.median(t[span:] - t[: n - span])) / span
+    close = (np.diff(t) < _CLOSE * usual) & ~repeats
+    if np.count_nonzero(close) < _PACKETS * n:
+        return None
+    last = np.append(np.flatnonzero(~close), n - 1)
+    if len(last) < 2:
+        return None
+    first, count, takes = int(last[0]), np.diff(last), np.diff(t[last])
+    whole = takes < _GAP * np.median(takes)
+    usual = float(takes[whole].sum()) / max(int(count[whole].sum()), 1)
+    out = np.interp(np.arange(n), last, t[last])
+    out[:first] = t[first] - usual * np.arange(first, 0, -1)
+    for k in np.flatnonzero(~whole & (takes > _GAP * usual * count)).tolist():
+        at = np.arange(last[k] + 1, last[k + 1])
+        out[at] = t[last[k + 1]] - usual * (last[k + 1] - at)
+    return out, n / len(last)
 
 
 def check_days(rows: Table, unit: str) -> None:
@@ -174,15 +220,7 @@ def check_imu_steps(rows: Table, unit: str) -> None:
         raise RecordingError(
             f"{rows.path}: {len(rows)} usable row; an IMU recording needs at least 2", key="table.few_rows"
         )
-    every = np.diff(rows["t"])
-    step = float(np.median(every))
-    usual = float(np.mean(every[every < _PAUSE])) if (every < _PAUSE).any() else step
-    if step < _BURST * usual:
-        raise RecordingError(
-            f"{rows.path}: most IMU rows are {step:.2g} s apart, but {usual:.2g} s in the mean: they come in "
-            "bursts, with the times of their arrival; write the times at which they were measured",
-            key="imu.bursts",
-        )
+    step = float(np.median(np.diff(rows["t"])))
     if 1e-5 < step < 0.5:
         return
     fitting = [u for u in TIME_UNITS if 2.5e-4 <= step / TIME_UNITS[unit] * TIME_UNITS[u] <= 0.1 and u != unit]
