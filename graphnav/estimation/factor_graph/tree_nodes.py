@@ -78,6 +78,25 @@ class Keyframe:
         return {x.key: x for x in (self.state, *(node for node, _ in self.nodes.values()))}.values()
 
 
+@dataclass(eq=False)
+class Block:
+    """Keyframes between two others, and what they say of these and of the parameters in force there."""
+
+    first: int  # numbers of the two
+    last: int
+    keys: list[int]  # variables that nothing else touches, in the order of their elimination
+    slots: set[int]  # indices of all factors on them
+    graph: gtsam.GaussianFactorGraph  # these, or what is left of them
+    done: bool = False
+
+    def eliminate(self) -> None:
+        """Leave only what is said of others."""
+        order = gtsam.Ordering()
+        for key in self.keys:
+            order.push_back(key)
+        self.graph, self.done = self.graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1], True
+
+
 Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, `LINK` or `ROWS`
 VariablePart = tuple[Variable, slice, Array]  # some numbers of a variable, and columns (m, k) of rows over them
 

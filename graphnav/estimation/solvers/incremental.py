@@ -53,6 +53,7 @@ class Incremental:
     problem: Problem
     lag: float = 120.0
     settled: list[SettledStates] = field(default_factory=list)  # in order; readers may clear them
+    due: int = 0  # keyframes that settle next
     look: float = _LEAST  # keyframes at which what has moved of a whole drive is looked at next
 
     def add(self, place: Place) -> None:
@@ -62,12 +63,15 @@ class Incremental:
         if window.push(replace(place, problem=self.problem)) > window.turn or grown:
             window.converge(renewed=self._renew)
             self.look = len(window) + max(_LEAST, len(window) // _GROWN)
-        count = window.leaving
-        if not count and are_due(window.stages[0].place.t, place.t, self.lag):
-            count = int(np.searchsorted(window.t, place.t - self.lag))
-            self._converge(count, _SETTLING, any(c.robust != "none" for c in self.problem.constraints))
-        if count and (window.smooth_back(count, window.smoothed) or len(window) <= _SHORT * window.smoothed):
-            self.settled.append(window.settle(count))
+        by_portions = len(window) > _SHORT * window.smoothed
+        if not self.due and are_due(window.stages[0].place.t, place.t, self.lag):
+            self.due = int(np.searchsorted(window.t, place.t - self.lag))
+            self._converge(self.due, _SETTLING, any(c.robust != "none" for c in self.problem.constraints))
+            if by_portions:
+                return
+        if self.due and (window.smooth_back(self.due, window.smoothed) or not by_portions):
+            self.settled.append(window.settle(self.due))
+            self.due = 0
 
     def finish(self) -> None:
         """End of input: settle all."""
