@@ -249,9 +249,9 @@ class Tree:
     def linearise(self, which: Iterable[int]) -> gtsam.GaussianFactorGraph:
         """The factors at some indices."""
         graph, factors = gtsam.NonlinearFactorGraph(), self.isam.getFactorsUnsafe()
-        for i in which:
-            if factors.at(i) is not None:
-                graph.push_back(factors.at(i))
+        for one in map(factors.at, which):
+            if one is not None:
+                graph.push_back(one)
         return graph.linearize(self.isam.getLinearizationPoint())
 
     def find_moves(self) -> Array:

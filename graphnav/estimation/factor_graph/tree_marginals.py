@@ -129,6 +129,7 @@ class Elimination:
         for block in tree.blocks:
             if block.done:
                 self._graph.push_back(block.graph)
+        self._net: gtsam.GaussianBayesNet | None = None  # of those that leave
         self._found: dict[int, Array] = {}  # covariances by variable, in its units
 
     def step(self, most: int = _AT_ONCE) -> bool:
@@ -144,11 +145,12 @@ class Elimination:
             order = fill_keys(gtsam.Ordering(), reversed(self._behind[portion]))
             self._graph = self._graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
             del self._behind[portion]
-        elif not self._found:
-            net = self._graph.eliminateSequential(fill_keys(gtsam.Ordering(), self._own), gtsam.EliminateQR)
-            self._found = Eliminated(net).compute_covariances()
-        else:
+        elif self._found:
             return True
+        elif self._net is None:
+            self._net = self._graph.eliminateSequential(fill_keys(gtsam.Ordering(), self._own), gtsam.EliminateQR)
+        else:
+            self._found = Eliminated(self._net).compute_covariances()
         return False
 
     def __getstate__(self) -> dict[str, Any]:
@@ -159,7 +161,7 @@ class Elimination:
             done._graph = self._graph.clone()  # blocks are added to it
         while not done.step():
             pass
-        return {**done.__dict__, "_graph": None}
+        return {**done.__dict__, "_graph": None, "_net": None}
 
     def settle(self) -> SettledStates:
         """States, parameters and covariances, all at once of what is left to be done."""

@@ -244,15 +244,11 @@ class Window:
     def smooth_back(self, count: int, most: int) -> bool:
         """A portion of `settle` for the first stages, over at most so many; True once it is done.
 
-        Keyframes that arrive meanwhile do not count; when some are removed, it starts again. To begin is a portion,
-        where one is not all.
+        Keyframes that arrive meanwhile do not count; when some are removed, it starts again.
         """
-        most = min(most, self.smoothed)
         if self._leaving is None:
             self._leaving = self._begin_leaving(count)
-            if most < len(self):
-                return False
-        return self._leaving.step(most)
+        return self._leaving.step(min(most, self.smoothed))
 
     def _begin_leaving(self, count: int) -> Leaving:
         return _Covariances(self, count)
