@@ -56,12 +56,12 @@ from graphnav.estimation.solvers.stages import (
     Place,
     append_columns,
 )
+from graphnav.estimation.solvers.window import ALMOST
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next
 _TIED = 1e-5  # of its prior sigma, by which a constant may differ from node to node: 0.03 % of it in ten hours
 _UNIT = np.repeat([1e-3, 1.0, 0.1, 1e-3, 1e-5], 3)  # of a state's errors, so that one threshold fits them all
 _TOGETHER, _GROWN = 16, 8  # keyframes that enter together, and what part of all of them if that is more
-_ALMOST = 0.3  # share of the threshold from which variables are relinearised along with those beyond it
 
 
 class Tree:
@@ -277,7 +277,7 @@ class Tree:
         moves = self.find_moves()
         if not (moves > share).any():
             return 0
-        which = np.flatnonzero(moves > _ALMOST * share)
+        which = np.flatnonzero(moves > ALMOST * share)
         step = np.zeros((len(self), 3))
         own = [self.keyframes[i] for i in which]
         step[which] = [k.state.delta[:3] - k.state.point[:3] for k in own]

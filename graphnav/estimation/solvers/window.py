@@ -44,7 +44,7 @@ _NOISE_SHARE = 0.01
 _G = 9.8  # m/s^2
 _DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
 _MAX_RELINEARISATIONS = 5
-_ALMOST = 0.3  # share of the limits from which stages are relinearised along with those beyond them
+ALMOST = 0.3  # share of the limits from which stages are relinearised along with those beyond them
 _LIMITS = {"rad": 1e-2, "s": _DELAY}
 
 
@@ -337,7 +337,7 @@ class Window:
         Keyframes may be added and removed before the next portion; rebuilt stages of removed ones are discarded.
         """
         if self._revision is None:
-            first = 0 if always and not self._rounds else self.find_first_moved(share, _ALMOST)
+            first = 0 if always and not self._rounds else self.find_first_moved(share, ALMOST)
             if first is None or self._rounds == _MAX_RELINEARISATIONS:
                 if first is None:
                     self._relaxation = Relaxation()
