@@ -20,12 +20,11 @@ from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
     are_near,
-    move_points,
     reuse_points,
     subtract_points,
     take_solution_points,
 )
-from graphnav.estimation.solvers.rows import compute_cost_at
+from graphnav.estimation.solvers.rows import compute_cost_at, shorten_step
 from graphnav.estimation.solvers.rts import smooth_backward, smooth_points
 
 CLEARLY_BETTER = 10.0  # half chi-square; a likelihood ratio of 22,000
@@ -156,25 +155,11 @@ def _descend(problem: Problem, start: Points, passes: Counter[str]) -> Points | 
             if abs(cost - lower) < problem.settings.solver.tolerance:
                 return ahead
             if not 0.0 < cost - lower < 0.5 * fall:  # not the convergence of Gauss and Newton
-                ahead, lower = _shorten(problem, points, ahead, cost, lower)
+                ahead, lower = shorten_step(problem, points, ahead, cost, lower)
             if not lower < cost:
                 break
             points, cost, fall = ahead, lower, cost - lower
     return None
-
-
-def _shorten(problem: Problem, start: Points, ahead: Points, cost: float, lower: float) -> tuple[Points, float]:
-    """The points on the way from a start to those ahead where the cost is least, by a parabola through its values at
-    both and halfway, and the cost there; those ahead where it is no less.
-    """
-    step = subtract_points(ahead, start)
-    halfway = compute_cost_at(problem, move_points(start, 0.5 * step))
-    bend = cost - 2.0 * halfway + lower
-    if not bend > 0.0:
-        return ahead, lower
-    nearer = move_points(start, (3.0 * cost - 4.0 * halfway + lower) / (4.0 * bend) * step)
-    least = compute_cost_at(problem, nearer)
-    return (nearer, least) if least < lower else (ahead, lower)
 
 
 def _solve_batch(problem: Problem, start: Points, least: float = np.inf) -> Points:

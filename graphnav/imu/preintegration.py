@@ -125,12 +125,12 @@ class Intervals:
         n, _, *size = self.parts.shape
         return replace(self, parts=np.empty((n, 0, *size)))
 
-    def is_out_of_range(self, bg: Array, angle: float = 1e-3) -> Array:
-        """(n,) whether the gyro bias moved beyond the range of the first-order correction.
+    def is_out_of_range(self, bg: Array, which: slice = slice(None), angle: float = 1e-3) -> Array:
+        """(n,) whether the gyro bias of some intervals moved beyond the range of the first-order correction.
 
         The neglected second-order term turns the force by angle^2/2: 5e-6 m/s at 1e-3 rad over 1 s.
         """
-        return np.linalg.norm(bg - self.bg, axis=-1) * self.T > angle
+        return np.linalg.norm(bg - self.bg[which], axis=-1) * self.T[which] > angle
 
 
 def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array, parts_of_noise: bool = False) -> Intervals:

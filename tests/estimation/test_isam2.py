@@ -318,21 +318,27 @@ def test_a_tree_made_again_from_its_rows_goes_on_as_before(built: Problem) -> No
 
 
 def test_covariances_from_the_other_end_are_the_marginals_of_the_tree_as_it_was(built: Problem) -> None:
-    """Of keyframes that are to leave a lag, in portions with others coming meanwhile, or a relinearisation."""
-    window = play(built, 60)
-    window.settle(20)
+    """Of keyframes that are to leave a lag, in portions with others coming meanwhile, a relinearisation, or keyframes
+    taken back; what is known of blocks of them is of those that have not changed.
+    """
+    window = play(built, 70)
+    window.settle(10)
     tree = window.tree
-    for again in (False, True):
+    kept = []
+    for change in ("more", "again", "back", "none"):
         leaving, count = Elimination(tree, 6), 6
+        kept.append(sum(block.done for block in tree.blocks))
         keyframes = tree.keyframes[:count]
         expected = [tree.isam.marginalCovariance(k.state.key)[:DIM, :DIM] for k in keyframes]
         delta, states = np.array([k.state.delta[:DIM] for k in keyframes]), [k.estimate for k in keyframes]
         unit = tree.keyframes[0].state.unit[:DIM]
         assert not leaving.step(20)
-        if again:
-            tree.linearise_again(range(3, len(tree)), lambda a, b: [stage.place for stage in window.stages[a:b]])
-        else:
-            fill(window, built, 60, 61)
+        if change == "again":
+            tree.linearise_again(range(33, len(tree)), lambda a, b: [stage.place for stage in window.stages[a:b]])
+        elif change == "back":
+            window.truncate(len(window) - 8)
+        elif change == "more":
+            fill(window, built, 70, 71)
         tree.read()
         found = leaving.settle()
         assert np.abs(found.states.minus(States.stack(states))).max() < 1e-12
@@ -340,3 +346,5 @@ def test_covariances_from_the_other_end_are_the_marginals_of_the_tree_as_it_was(
         for a, b in zip(found.covariance, own, strict=True):
             sd = np.sqrt(np.diag(b))
             np.testing.assert_allclose(a / sd / sd[:, None], b / sd / sd[:, None], atol=1e-8)
+    assert 0 < kept[2] < kept[1]
+    assert kept[3] > 0

@@ -29,6 +29,7 @@ from graphnav.core.state import DIM
 from graphnav.estimation.factor_graph.tree_nodes import (
     LINK,
     ROWS,
+    Block,
     Keyframe,
     Made,
     Nodes,
@@ -55,12 +56,12 @@ from graphnav.estimation.solvers.stages import (
     Place,
     append_columns,
 )
+from graphnav.estimation.solvers.window import ALMOST
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next
 _TIED = 1e-5  # of its prior sigma, by which a constant may differ from node to node: 0.03 % of it in ten hours
 _UNIT = np.repeat([1e-3, 1.0, 0.1, 1e-3, 1e-5], 3)  # of a state's errors, so that one threshold fits them all
 _TOGETHER, _GROWN = 16, 8  # keyframes that enter together, and what part of all of them if that is more
-_ALMOST = 0.3  # share of the threshold from which variables are relinearised along with those beyond it
 
 
 class Tree:
@@ -81,6 +82,7 @@ class Tree:
         self.turn = turn
         # factors of the newest keyframes, and on their variables
         self._waiting: list[tuple[list[Made], list[Any]]] = []
+        self._stale = False  # whether the tree knows more than was taken over from it
         self.keyframes: list[Keyframe] = []
         self._prior = prior
         self._number = self._key = 0
@@ -88,6 +90,7 @@ class Tree:
         self.variables: dict[int, Variable] = {}
         self._first_sigma: dict[str, Array] = {}
         self._constant: set[str] = set()
+        self.blocks: list[Block] = []  # of keyframes that nothing has changed since
         self.held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
 
     def __len__(self) -> int:
@@ -217,27 +220,39 @@ class Tree:
             own = self.keyframes[-len(waiting) :]
             made, known = ([one for part in parts for one in part] for parts in zip(*waiting, strict=True))
             fresh = [x for k in own for x in k.variables if x.first == k.number]
-            self._replace(made, [], max(own[0].number - 1, self.keyframes[0].number), fresh, known)
+            self._replace(made, [], own[0].number - 1, fresh, known)
 
     def _replace(
         self, made: Sequence[Made], gone: Sequence[int], first: int, fresh: Sequence[Variable] = (), known: Any = ()
     ) -> None:
         """Have factors in place of others, on keyframes from number `first` on."""
         # elimination order is that of time, in which those in force are the newest, though nothing new may touch them:
-        # else what leaves would stand above them. With much to do, GTSAM rebuilds the whole tree
+        # else what leaves would stand above them. With much to do, GTSAM rebuilds the whole tree. The keyframe before
+        # the first may be in one clique with it, and would have no place in the order
+        first = max(first - 1, self.keyframes[0].number)
         late = [v for v in self.variables.values() if v.last >= first]
         if 2 * len(late) > len(self.variables) and not fresh:
             late, first = list(self.variables.values()), self.keyframes[0].number
         order, new = [(v, v.last - first) for v in late], {v.key for v in fresh}
         again = [v for v in late if v.key not in new]
+        self._stale = True
         update_isam(self.isam, self.keyframes[-1].t, made, gone, fresh, known, order, again)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:
         """Bring all estimates up to date."""
         self._enter()
-        if self.isam is not None:
+        if self._stale and self.isam is not None:
             take_deltas(self.isam, self.variables.values())
+            self._stale = False
+
+    def linearise(self, which: Iterable[int]) -> gtsam.GaussianFactorGraph:
+        """The factors at some indices."""
+        graph, factors = gtsam.NonlinearFactorGraph(), self.isam.getFactorsUnsafe()
+        for one in map(factors.at, which):
+            if one is not None:
+                graph.push_back(one)
+        return graph.linearize(self.isam.getLinearizationPoint())
 
     def find_moves(self) -> Array:
         """(K,) how far keyframes' estimates are from where their rows were linearised, 1 at the limit."""
@@ -245,11 +260,14 @@ class Tree:
             return np.empty(0)
         off = np.array([k.state.delta[:3] - k.state.point[:3] for k in self.keyframes])
         moves = np.linalg.norm(off, axis=1) / self.turn
-        first = self.keyframes[self.held].number
+        before, first = self.keyframes[0].number, self.keyframes[self.held].number
         limited = [x for x in self.variables.values() if len(x.limit) and x.last >= first]
-        far = {x.key: float(np.max(np.abs(x.delta - x.point) / x.limit)) for x in limited}
-        for k, keyframe in enumerate(self.keyframes):
-            moves[k] = max(moves[k], *(far.get(x.key, 0.0) for x in keyframe.variables))
+        if limited:
+            far = np.concatenate([x.delta - x.point for x in limited]) / np.concatenate([x.limit for x in limited])
+            edge = np.cumsum([0, *(len(x.limit) for x in limited[:-1])])
+            for x, move in zip(limited, np.maximum.reduceat(np.abs(far), edge).tolist(), strict=True):
+                own = slice(max(x.first - before, 0), x.last - before + 1)
+                moves[own] = np.maximum(moves[own], move)
         moves[: self.held] = 0.0
         return moves
 
@@ -259,7 +277,7 @@ class Tree:
         moves = self.find_moves()
         if not (moves > share).any():
             return 0
-        which = np.flatnonzero(moves > _ALMOST * share)
+        which = np.flatnonzero(moves > ALMOST * share)
         step = np.zeros((len(self), 3))
         own = [self.keyframes[i] for i in which]
         step[which] = [k.state.delta[:3] - k.state.point[:3] for k in own]
@@ -301,10 +319,12 @@ class Tree:
                     if measured and ROWS in keyframe.slots:
                         made.append((keyframe, ROWS, make_row_factor(keyframe, measured, turns[k + 1])))
         gone = [keyframe.slots.pop(name) for keyframe, name, _ in made]
+        changed = {keyframe.number for keyframe, _, _ in made}
+        self.blocks = [b for b in self.blocks if changed.isdisjoint(range(b.first + 1, b.last + 1))]
         for i in rows:
             for x in self.keyframes[i].variables:
                 x.point = x.delta.copy()
-        self._replace(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
+        self._replace(made, gone, self.keyframes[min(rows)].number - 1)
 
     # ---------------------------------------------------------------------------------------------------- leaving
     def release(self) -> None:
@@ -317,7 +337,8 @@ class Tree:
         entered = len(self) - len(self._waiting)
         del self._waiting[max(keep - entered, 0) :], self.keyframes[keep:]
         last = self.keyframes[-1]
-        self._number, self._in_force = last.number + 1, last.nodes
+        self._number, self._in_force, self._stale = last.number + 1, last.nodes, True
+        self.blocks = [block for block in self.blocks if block.last <= last.number]
         # factors on variables that began later are removed as well
         late = {x.key for x in self.variables.values() if x.first > last.number}
         for key in late:
@@ -333,7 +354,7 @@ class Tree:
     def __getstate__(self) -> dict[str, Any]:
         """All but the tree itself, which is made again from its factors."""
         self._enter()
-        return {**self.__dict__, "isam": self.isam.getFactorsUnsafe().serialize()}
+        return {**self.__dict__, "blocks": [], "isam": self.isam.getFactorsUnsafe().serialize()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         text, graph = state.pop("isam"), gtsam.NonlinearFactorGraph()

@@ -15,8 +15,7 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.factor_graph.gaussian import make_jacobian_factor
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import Columns, shift
-from graphnav.estimation.solvers.stages import Measured, Place
-from graphnav.estimation.solvers.stages import rotate_columns as turned_by
+from graphnav.estimation.solvers.stages import Measured, Place, rotate_columns
 from graphnav.estimation.solvers.window import find_parameter_limits
 
 LINK, ROWS = "interval", "rows"  # factors of a keyframe: the interval before it, and all of its measurements together
@@ -76,6 +75,25 @@ class Keyframe:
     def variables(self) -> Collection[Variable]:
         """That its rows may touch, its state first."""
         return {x.key: x for x in (self.state, *(node for node, _ in self.nodes.values()))}.values()
+
+
+@dataclass(eq=False)
+class Block:
+    """Keyframes between two others, and what they say of these and of the parameters in force there."""
+
+    first: int  # numbers of the two
+    last: int
+    keys: list[int]  # variables that nothing else touches, in the order of their elimination
+    slots: set[int]  # indices of all factors on them
+    graph: gtsam.GaussianFactorGraph  # these, or what is left of them
+    done: bool = False
+
+    def eliminate(self) -> None:
+        """Leave only what is said of others."""
+        order = gtsam.Ordering()
+        for key in self.keys:
+            order.push_back(key)
+        self.graph, self.done = self.graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1], True
 
 
 Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, `LINK` or `ROWS`
@@ -182,7 +200,10 @@ def compute_turns(keyframes: Sequence[Keyframe]) -> Array:
 
 def make_interval_factor(last: Keyframe, x: Variable, link: Array, turns: Array) -> Any:
     """A factor of an interval's whitened rows (15, 15 + D + 1), from the keyframe before to a state, J_r of both."""
-    states = [(last.state, turned_by(link[:, :DIM], turns[0])), (x, turned_by(link[:, DIM : 2 * DIM], turns[1]))]
+    states = [
+        (last.state, rotate_columns(link[:, :DIM], turns[0])),
+        (x, rotate_columns(link[:, DIM : 2 * DIM], turns[1])),
+    ]
     return _make_factor(last, states, link[:, DIM:-1], link[:, -1])
 
 
@@ -190,7 +211,7 @@ def make_row_factor(keyframe: Keyframe, measured: Sequence[Measured], turn: Arra
     """A factor of measurements linearised where keyframe, of J_r (3, 3), and parameters are now."""
     D = measured[0].H.shape[-1]
     H, b = (np.concatenate(rows) for rows in zip(*((x.H.reshape(-1, D), x.b.ravel()) for x in measured), strict=True))
-    return _make_factor(keyframe, [(keyframe.state, turned_by(H[:, :DIM], turn))], H, b)
+    return _make_factor(keyframe, [(keyframe.state, rotate_columns(H[:, :DIM], turn))], H, b)
 
 
 def _make_factor(keyframe: Keyframe, states: Sequence[tuple[Variable, Array]], H: Array, b: Array) -> Any:

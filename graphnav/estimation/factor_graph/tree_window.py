@@ -38,7 +38,7 @@ class TreeWindow(Window):
     """A window whose estimates are a `Tree`'s."""
 
     solver = "isam2"
-    smoothed = 40
+    smoothed = 32
 
     def __init__(self, prior: Message, turn: float) -> None:
         super().__init__(prior, turn)

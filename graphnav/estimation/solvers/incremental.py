@@ -53,27 +53,36 @@ class Incremental:
     problem: Problem
     lag: float = 120.0
     settled: list[SettledStates] = field(default_factory=list)  # in order; readers may clear them
+    due: int = 0  # keyframes that settle next
     look: float = _LEAST  # keyframes at which what has moved of a whole drive is looked at next
 
     def add(self, place: Place) -> None:
-        """Add a keyframe, and settle those that are older than the lag by then."""
+        """Add a keyframe, and settle those that are older than the lag by then: those of a large window in portions,
+        as they were known then, ahead of the following keyframes.
+        """
         window = self.window
+        if self.due and window.smooth_back(self.due, window.smoothed):
+            self._settle()
         grown = np.isinf(self.lag) and len(window) >= self.look
         if window.push(replace(place, problem=self.problem)) > window.turn or grown:
             window.converge(renewed=self._renew)
             self.look = len(window) + max(_LEAST, len(window) // _GROWN)
-        count = window.leaving
-        if not count and are_due(window.stages[0].place.t, place.t, self.lag):
-            count = int(np.searchsorted(window.t, place.t - self.lag))
-            self._converge(count, _SETTLING, any(c.robust != "none" for c in self.problem.constraints))
-        if count and (window.smooth_back(count, window.smoothed) or len(window) <= _SHORT * window.smoothed):
-            self.settled.append(window.settle(count))
+        if not self.due and are_due(window.stages[0].place.t, place.t, self.lag):
+            self.due = int(np.searchsorted(window.t, place.t - self.lag))
+            self._converge(self.due, _SETTLING, any(c.robust != "none" for c in self.problem.constraints))
+            if len(window) <= _SHORT * window.smoothed:
+                self._settle()
+
+    def _settle(self) -> None:
+        self.settled.append(self.window.settle(self.due))
+        self.due = 0
 
     def finish(self) -> None:
         """End of input: settle all."""
         if len(self.window):
-            self._converge(len(self.window), _FINE, always=True)
-            self.settled.append(self.window.settle(len(self.window)))
+            self.due = len(self.window)
+            self._converge(self.due, _FINE, always=True)
+            self._settle()
 
     def _converge(self, count: int, share: float, always: bool = False) -> None:
         """Relinearise until nothing has moved, about intervals integrated at the present biases, for the first stages

@@ -254,15 +254,24 @@ def integrate_again(problem: Problem, states: States, scale: Array | None, first
     states : of keyframes from `first` on; intervals before stay as they are, of those behind the last is the guess.
     scale : (k,) scale errors of the IMU, where they are parameters.
     """
-    rows = slice(first, None)
-    ba, bg = problem.intervals.ba.copy(), problem.intervals.bg.copy()
-    at = np.minimum(np.arange(len(ba) - first), max(len(states) - 2, 0))
-    ba[rows], bg[rows] = states.ba[at], states.bg[at]
-    if scale is not None:
-        of_accel, of_gyro = convert_to_biases(scale, *(x[rows] for x in problem.intervals.inputs))
-        ba[rows], bg[rows] = ba[rows] + of_accel, bg[rows] + of_gyro
-    far = problem.intervals.is_out_of_range(bg)
-    return (problem.reintegrate(ba, bg), int(far.sum())) if far.any() else (problem, 0)
+    intervals = problem.intervals
+    rows = slice(first, len(intervals.bg))
+    near = slice(first, min(first + 2 * len(states), rows.stop))  # of a long drive: what is further ahead can wait
+    if not intervals.is_out_of_range(_guess_biases(problem, states, scale, near)[1], near).any():
+        return problem, 0
+    ba, bg = intervals.ba.copy(), intervals.bg.copy()
+    ba[rows], bg[rows] = _guess_biases(problem, states, scale, rows)
+    return problem.reintegrate(ba, bg), int(intervals.is_out_of_range(bg).sum())
+
+
+def _guess_biases(problem: Problem, states: States, scale: Array | None, rows: slice) -> tuple[Array, Array]:
+    """Biases (n, 3) of intervals `rows`, the first of which begins at the first of some states."""
+    at = np.minimum(np.arange(rows.stop - rows.start), max(len(states) - 2, 0))
+    ba, bg = states.ba[at], states.bg[at]
+    if scale is None:
+        return ba, bg
+    of_accel, of_gyro = convert_to_biases(scale, *(x[rows] for x in problem.intervals.inputs))
+    return ba + of_accel, bg + of_gyro
 
 
 def split_values(problem: Problem, points: Points) -> dict[str, Array]:

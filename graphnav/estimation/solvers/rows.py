@@ -18,7 +18,6 @@ from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, l
 from graphnav.estimation.solvers.passes import make_points, move_points, spread_nodes, subtract_points
 from graphnav.imu.dynamics import SCALE
 
-_SHORTEST = 6  # times that a step is halved
 _SHARED_BLOCKS = 6  # blocks of rows with the same variables
 WhitenedRows = list[tuple[list[tuple[Array, Array]], Array]]  # blocks of (keys, A (N, m, k)), and b (N, m)
 
@@ -180,14 +179,18 @@ def compute_cost_at(problem: Problem, points: Points) -> float:
     return whiten(problem, at, Layout(problem))[1]
 
 
-def shorten_step(problem: Problem, about: Points, ahead: Points) -> Points:
-    """The points after a step of Gauss and Newton, halved until the cost falls; `about` if it does not."""
-    step, now = subtract_points(ahead, about), compute_cost_at(problem, about)
-    for share in 0.5 ** np.arange(_SHORTEST + 1.0):
-        points = move_points(about, share * step)
-        if compute_cost_at(problem, points) < now:
-            return points
-    return about
+def shorten_step(problem: Problem, start: Points, ahead: Points, cost: float, lower: float) -> tuple[Points, float]:
+    """The points on the way from a start to those ahead where the cost is least, by a parabola through its values at
+    both and halfway, and the cost there; those ahead where it is no less.
+    """
+    step = subtract_points(ahead, start)
+    halfway = compute_cost_at(problem, move_points(start, 0.5 * step))
+    bend = cost - 2.0 * halfway + lower
+    if not bend > 0.0:
+        return ahead, lower
+    nearer = move_points(start, (3.0 * cost - 4.0 * halfway + lower) / (4.0 * bend) * step)
+    least = compute_cost_at(problem, nearer)
+    return (nearer, least) if least < lower else (ahead, lower)
 
 
 def compute_column_norms(rows: WhitenedRows, layout: Layout) -> Array:

@@ -44,7 +44,7 @@ _NOISE_SHARE = 0.01
 _G = 9.8  # m/s^2
 _DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
 _MAX_RELINEARISATIONS = 5
-_ALMOST = 0.3  # share of the limits from which stages are relinearised along with those beyond them
+ALMOST = 0.3  # share of the limits from which stages are relinearised along with those beyond them
 _LIMITS = {"rad": 1e-2, "s": _DELAY}
 
 
@@ -244,15 +244,11 @@ class Window:
     def smooth_back(self, count: int, most: int) -> bool:
         """A portion of `settle` for the first stages, over at most so many; True once it is done.
 
-        Keyframes that arrive meanwhile do not count; when some are removed, it starts again. To begin is a portion,
-        where one is not all.
+        Keyframes that arrive meanwhile do not count; when some are removed, it starts again.
         """
-        most = min(most, self.smoothed)
         if self._leaving is None:
             self._leaving = self._begin_leaving(count)
-            if most < len(self):
-                return False
-        return self._leaving.step(most)
+        return self._leaving.step(min(most, self.smoothed))
 
     def _begin_leaving(self, count: int) -> Leaving:
         return _Covariances(self, count)
@@ -341,7 +337,7 @@ class Window:
         Keyframes may be added and removed before the next portion; rebuilt stages of removed ones are discarded.
         """
         if self._revision is None:
-            first = 0 if always and not self._rounds else self.find_first_moved(share, _ALMOST)
+            first = 0 if always and not self._rounds else self.find_first_moved(share, ALMOST)
             if first is None or self._rounds == _MAX_RELINEARISATIONS:
                 if first is None:
                     self._relaxation = Relaxation()
