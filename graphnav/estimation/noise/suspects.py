@@ -21,6 +21,7 @@ from graphnav.estimation.noise.spans import (
     Span,
     are_covered,
     join,
+    join_adjacent,
     join_faults,
     split_at_steps,
 )
@@ -48,7 +49,7 @@ def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> lis
 def find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) -> tuple[list[Span], int]:
     """Wrong segments, of those into which the ends of suspected spans divide the drive, and filter passes that it took.
 
-    None unless one of them outlasts the tests, of which the spans are otherwise.
+    None unless one of them, or several without a fix between, outlasts the tests, of which the spans are otherwise.
     """
     within = join(suspected)
     if len(within) < 2:
@@ -58,7 +59,8 @@ def find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) ->
     edges = sorted({*(begin for begin, _ in suspected), *t[behind[behind < len(t)]].tolist()})
     used = apply_noise(base, replace(found.noise, excluded={}))
     segments = find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
-    outlasting = (one for one in segments if one[1] - one[0] > PATIENCE and not are_covered([one], within))
+    runs = join_adjacent(segments, t)
+    outlasting = (one for one in runs if one[1] - one[0] > PATIENCE and not are_covered([one], within))
     return segments if any(outlasting) else [], 1
 
 
