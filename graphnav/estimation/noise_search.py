@@ -195,8 +195,10 @@ def _start_without(
     again = replace(found, stated=without.problem)
     same = np.array_equal(without.problem.t, built.problem.t)
 
-    def estimate(before: NoiseEstimate, near: tuple[Points, Problem] | None = None) -> NoiseEstimate:
-        return estimate_noise(again.base, without.aligned.until, before.noise, near, progress)
+    def estimate(
+        before: NoiseEstimate, near: tuple[Points, Problem] | None = None, known: NoiseEstimate | None = None
+    ) -> NoiseEstimate:
+        return estimate_noise(again.base, without.aligned.until, before.noise, near, progress, known=known)
 
     def go_on(before: NoiseEstimate) -> NoiseEstimate:
         if not same:
@@ -204,7 +206,7 @@ def _start_without(
         # the points known rest on the start before, and a filter from the new one may diverge: the likelier
         near = estimate(before, before.get_linearisation(found.base))
         try:
-            fresh = estimate(before)
+            fresh = estimate(before, known=near)
         except BREAKDOWN:
             return near
         best = max(near, fresh, key=lambda one: one.log_evidence)

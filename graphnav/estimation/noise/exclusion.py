@@ -360,6 +360,8 @@ def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
             return replace(free, passes=passes)
         if free.noise.excluded == found.noise.excluded:  # the same model, already converging
             start, near = free.noise, free.get_linearisation(base)
+        elif not _may_be_disturbed(base, found):
+            return replace(found, passes=passes)
     disturbed = weigh_evidence(base, estimate_noise(base, None, start, near, intervals=True))
     passes = passes + disturbed.passes
     if log_evidence(base, disturbed) <= log_evidence(base, found):
