@@ -176,12 +176,13 @@ def leave_out_jointly(
 ) -> JointEstimate:
     """The same without spans of wrong measurements; what is given is as for `estimate_jointly`.
 
-    With these among the measurements, an IMU that is worse may be the likelier explanation, so rivals are compared now.
+    With these among the measurements, an IMU that is worse may be the likelier explanation, so rivals are compared now,
+    unless all figures are estimated without some measurements.
     """
     best = replace(
         found, rival=None, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress)
     )
-    if found.rival is None:
+    if found.rival is None or best.noise.excluded:  # without what may have made the IMU look worse
         return best
     best, plain = best.weigh(), leave_out_jointly(found.rival, settings, opening, progress).weigh()
     likelier = best.compute_evidence() > plain.compute_evidence() + plain.estimate.gained_by_chance
@@ -242,7 +243,8 @@ def _leave_out_faults(
 def _free_constants(found: JointEstimate, settings: GnssSettings, *ways: _Estimate) -> JointEstimate:
     """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew, in the
     first of some ways by which the evidence is no smaller: the figures found lead to the nearest optimum soonest, and
-    where a wrong constant or a fault is behind them, that is a bad one.
+    where a wrong constant or a fault is behind them, that is a bad one. Where it is as likely as before but for what
+    is gained by chance, nothing is behind them, and what is free stays.
 
     Where these are free already, the estimate stays; where it is the one that they were tested with last, so do they.
     """
@@ -261,10 +263,12 @@ def _free_constants(found: JointEstimate, settings: GnssSettings, *ways: _Estima
             for estimate in ways:
                 other = replace(found, freed=freed, estimate=estimate(free(base, freed), found)).weigh()
                 passes = passes + other.estimate.passes + Counter(filter=1)
-                # from the priors, figures may lead to a worse optimum than before
-                by_chance = other.estimate.gained_by_chance if estimate is ways[-1] else 0.0
-                if found.compute_evidence() <= other.compute_evidence() + by_chance:
+                gained, by_chance = other.compute_evidence() - found.compute_evidence(), other.estimate.gained_by_chance
+                # from the priors, figures may lead to a worse optimum than before; of fewer constants less is expected
+                if gained >= (-by_chance if estimate is ways[-1] or freed.keys() < before.keys() else 0.0):
                     found = other
+                    break
+                if gained > -by_chance:  # in the same optimum, where they are worth nothing
                     break
             freed = update_freed(base, found.estimate, found.freed)
     except BREAKDOWN:

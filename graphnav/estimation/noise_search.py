@@ -24,8 +24,8 @@ from graphnav.detectors.base import NONE
 from graphnav.estimation.building import BuiltProblem, ProblemBuilder
 from graphnav.estimation.joint_estimate import (
     JointEstimate,
+    begin_jointly,
     estimate_as_stated,
-    estimate_jointly,
     free_contradicted,
     leave_out_jointly,
     revise_jointly,
@@ -169,20 +169,29 @@ def _find(builder: ProblemBuilder, begun: Estimated, progress: Progress | None) 
     settings, built = builder.settings.gnss, begun[0]
     found = leave_out_jointly(begun[1], settings, built.aligned.until, progress)
     if found.excluded_share > _MOST_WRONG:
-        # most fixes contradict the start: align again with the fixes behind those that the alignment used
-        try:
-            later = builder.build_later(built)
-            other = estimate_jointly(later.problem, settings, later.aligned.until, progress)
-            total = found.estimate.passes + other.estimate.passes
-            if other.excluded_share < found.excluded_share:
-                built, found = later, other
-            found = found.count(total)
-        except EstimationError:
-            pass  # no motion later on
+        with contextlib.suppress(EstimationError):  # no motion later on
+            built, found = _start_later(builder, begun, found, progress)
     if found.noise.excluded:
         built, found = _start_without(builder, built, found, progress)
     found = revise_jointly(found, settings, built.aligned.until, progress)
     return _start_anew(builder, built, found) if found.freed else (built, found)
+
+
+def _start_later(
+    builder: ProblemBuilder, begun: Estimated, found: JointEstimate, progress: Progress | None
+) -> Estimated:
+    """The same with a start by the fixes behind those that the alignment used, if it contradicts fewer of them."""
+    settings, later = builder.settings.gnss, builder.build_later(begun[0])
+    other = begin_jointly(later.problem, settings, later.aligned.until, progress)
+    passes = found.estimate.passes
+    # where all measurements agree no better with that start, it is not what is wrong
+    comparable = np.array_equal(later.problem.t, begun[0].problem.t)
+    if comparable and other.compute_evidence() <= begun[1].compute_evidence() + other.estimate.gained_by_chance:
+        return begun[0], found.count(passes + other.estimate.passes)
+    other = leave_out_jointly(other, settings, later.aligned.until, progress)
+    passes = passes + other.estimate.passes
+    fewer = other.excluded_share < found.excluded_share
+    return (later, other.count(passes)) if fewer else (begun[0], found.count(passes))
 
 
 def _start_without(
@@ -195,8 +204,10 @@ def _start_without(
     again = replace(found, stated=without.problem)
     same = np.array_equal(without.problem.t, built.problem.t)
 
-    def estimate(before: NoiseEstimate, near: tuple[Points, Problem] | None = None) -> NoiseEstimate:
-        return estimate_noise(again.base, without.aligned.until, before.noise, near, progress)
+    def estimate(
+        before: NoiseEstimate, near: tuple[Points, Problem] | None = None, known: NoiseEstimate | None = None
+    ) -> NoiseEstimate:
+        return estimate_noise(again.base, without.aligned.until, before.noise, near, progress, known=known)
 
     def go_on(before: NoiseEstimate) -> NoiseEstimate:
         if not same:
@@ -204,7 +215,7 @@ def _start_without(
         # the points known rest on the start before, and a filter from the new one may diverge: the likelier
         near = estimate(before, before.get_linearisation(found.base))
         try:
-            fresh = estimate(before)
+            fresh = estimate(before, known=near)
         except BREAKDOWN:
             return near
         best = max(near, fresh, key=lambda one: one.log_evidence)

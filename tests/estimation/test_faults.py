@@ -26,18 +26,22 @@ from graphnav.estimation.faults.likelihood_ratio import update_tests
 from graphnav.estimation.faults.segments import _respond, _Runs, find_wrong_segments
 from graphnav.estimation.faults.verdicts import Verdicts
 from graphnav.estimation.faults.watch import FALSE_ALARM, MINUTE, Bank
-from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
+from graphnav.estimation.noise.apply import apply_noise
+from graphnav.estimation.noise.decision import add_outliers, explain, log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
 from graphnav.estimation.noise.explanations import (
     EXPLANATIONS,
+    FIXES,
     ErrorSizes,
     PriorCosts,
     Trials,
     add_common_errors,
     compute_evidence,
 )
+from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.spans import join_adjacent, list_before, move_end, split_at_steps
+from graphnav.estimation.noise.suspects import predict_left_out
 from graphnav.estimation.noise.tails import compute_log_normaliser
 from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
@@ -350,6 +354,27 @@ def test_weights_of_outliers_raise_the_evidence(built: Problem) -> None:
         forward = trials.filter_about(problem, kinds)
         evidence.append(float(forward.log_likelihood.sum() - cost.sum()))
     assert np.all(np.diff(evidence) > 0.0)
+
+
+def test_an_outlier_behind_a_fault_does_not_date_it(drive: tuple[Recording, Trajectory]) -> None:
+    """Right fixes are no part of the fault before them, though one of them is an outlier."""
+    recording = drive[0].crop(0.0, 200.0)
+    assert recording.gnss is not None
+    t = recording.gnss.t
+    first, end, last = np.searchsorted(t - recording.start, [100.0, 130.0, 140.0]).tolist()
+    wrong = moved(recording, np.arange(first, end), np.array([20.0, 5.0, 0.0]))
+    wrong = moved(wrong, np.array([last - 2]), np.array([0.0, 30.0, 0.0]))
+    settings, frame = parse_settings({}), LocalFrame(choose_origin(wrong))
+    every = ProblemBuilder(wrong, wrong, settings, frame, Clock(), Later(lambda: None))
+    detections = detect(wrong, settings)
+    base = every.build(every.align(wrong, detections.stationary), detections, parts=True).problem
+    without = NoiseModel(excluded={"gnss_position": ((float(t[first]), float(t[last - 1])),)})
+    found = estimate_noise(base, start=without)
+    errors = predict_left_out(apply_noise(base, found.noise), found)
+    spans = [[(float(t[first]), float(t[i - 1]))] for i in (end, last)]
+    right, longer = (explain(base, add_outliers(found, errors, some), some, [FIXES[:1]]) for some in spans)
+    assert right.noise.excluded == {"gnss_position": tuple(spans[0])}
+    assert right.log_evidence > longer.log_evidence
 
 
 def test_evidence_of_explanations_in_succession(built: Problem) -> None:

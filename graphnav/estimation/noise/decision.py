@@ -41,7 +41,8 @@ class Decision:
     noise: NoiseModel
     log_evidence: float
     passes: Counter[str] = field(default_factory=Counter)
-    estimate: NoiseEstimate | None = None  # with this noise, where nothing is left out but figures were estimated again
+    estimate: NoiseEstimate | None = None  # without what is suspected, by whose figures it is; with this noise, where
+    # nothing is left out
     rival: Decision | None = None  # the likeliest by spans as the tests found them, if this one is by segments
 
 
@@ -143,12 +144,15 @@ def weigh_rest(base: Problem, found: NoiseEstimate, excluded: Mapping[str, tuple
 
 
 def add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
-    """The estimate with weights for fixes in spans that it leaves out, so that each may be a single outlier."""
+    """The estimate with weights for fixes in spans, and for all that it leaves out, so that each may be an outlier: a
+    single one behind a fault, used as if it were Gaussian, would cost more evidence than the fault.
+    """
     weights = dict(found.noise.weights)
     for name, (t, squared, m) in errors.items():
+        asked = [*spans, *found.noise.excluded.get(name, ())]
         weight = weigh_outlying(squared, m, get_tail_index(found.noise.tails, name, m))
-        kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
-        inside = mask_times(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
+        kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), asked)
+        inside = mask_times(t, asked) & np.isin(t, t[weight < 1.0])  # with all rows of their times
         both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
         order = np.argsort(both, kind="stable")
         weights[name] = RowWeights(both[order], of_both[order])

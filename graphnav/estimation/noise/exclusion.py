@@ -35,8 +35,10 @@ gain by chance.
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
 are suspected instead, the same way, and the likeliest stands, of both and of the estimate with all measurements. Where
-that leaves other spans out, so are the fixes before these. Figures bent by a fault find other segments wrong than those
-estimated without it: the segments that are wrong by the figures of what stands are suspected last.
+that leaves other spans out, so are the fixes before these. An estimate without the fixes before that explains the rest
+no better than what stands has lost: those fixes agree with the latter, and would have to be explained as wrong.
+Figures bent by a fault find other segments wrong than those estimated without it: the segments that are wrong by the
+figures of what stands are suspected last.
 """
 
 from __future__ import annotations
@@ -118,7 +120,7 @@ def estimate_without_faults(
     passes = passes + best.passes
     rival = None
     if decision.rival is not None:
-        rival = decision.rival.estimate or found
+        rival = found
         if decision.rival.noise.excluded:
             rival = _estimate_without(base, opening, decision.rival, found, progress)
             passes = passes + rival.passes
@@ -132,10 +134,11 @@ def estimate_without_faults(
             passes, other = passes + Counter(filter=spent), None
             if suspected and suspected != before:
                 with contextlib.suppress(*BREAKDOWN):  # from a filter that follows the wrong fixes
-                    other = _estimate_other(base, opening, found, leading, suspected, progress)
+                    other, more = _estimate_other(base, opening, found, leading, suspected, progress)
+                    passes = passes + more
             if other is None:
                 break
-            other = weigh_evidence(base, other)
+            other = weigh_evidence(base, replace(other, passes=Counter()))
             passes = passes + other.passes
             candidates.append(other)
             if log_evidence(base, other) <= log_evidence(base, leading):
@@ -151,21 +154,23 @@ def _estimate_other(
     best: NoiseEstimate,
     suspected: list[Span],
     progress: Callable[[str, float], None] | None,
-) -> NoiseEstimate | None:
-    """Estimate without other suspected spans; None if the result is the same as before.
+) -> tuple[NoiseEstimate | None, Counter[str]]:
+    """Estimate without other suspected spans, None if the result is the same as before; and passes.
 
     Parameters
     ----------
     found : with all measurements.
     best : without the spans that were suspected before.
     """
-    decision = _unmask(base, found, Decision(best.noise, -np.inf), suspected)
+    excluded = _list_spans(best)
+    apart = len(join([*excluded, *suspected])) == len(excluded) + len(suspected)
+    decision = _unmask(base, found, Decision(best.noise, -np.inf), suspected, best if apart else None)
     if decision.noise.excluded == best.noise.excluded:
-        return None
-    if decision.estimate is not None:
-        return replace(decision.estimate, passes=decision.passes)
+        return None, decision.passes
+    if not decision.noise.excluded:
+        return decision.estimate, decision.passes
     other = _estimate_without(base, opening, decision, found, progress)
-    return replace(other, passes=decision.passes + other.passes)
+    return other, decision.passes + other.passes
 
 
 def _estimate_without(
@@ -176,13 +181,15 @@ def _estimate_without(
     progress: Callable[[str, float], None] | None,
 ) -> NoiseEstimate:
     """Estimate without the spans of a decision, and decide again at their ends."""
-    # from the priors: figures estimated with the fault among the data are far from their final values
-    start = NoiseModel(weights=decision.noise.weights, excluded=decision.noise.excluded)
+    # figures estimated with the fault among the data are far from their final values, and the priors are nearer
+    starts = [NoiseModel(weights=decision.noise.weights, excluded=decision.noise.excluded), decision.noise]
+    if decision.estimate is not None:
+        starts.reverse()
     near = (decision.estimate or found).get_linearisation(base)
-    estimate = weigh_evidence(base, estimate_noise(base, opening, start, near, progress))
+    estimate = weigh_evidence(base, estimate_noise(base, opening, starts[0], near, progress))
     if log_evidence(base, estimate) + estimate.gained_by_chance < decision.log_evidence:
         # a worse optimum than the one that the decision is near
-        other = weigh_evidence(base, estimate_noise(base, opening, decision.noise, near, progress))
+        other = weigh_evidence(base, estimate_noise(base, opening, starts[1], near, progress))
         best = max(estimate, other, key=lambda one: log_evidence(base, one))
         estimate = replace(best, passes=estimate.passes + other.passes)
     return readmit(base, estimate)
@@ -230,20 +237,27 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     return first if are_covered(masked, _list_spans(first)) else _unmask(base, found, first, masked)
 
 
-def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[Span]) -> Decision:
+def _unmask(
+    base: Problem, found: NoiseEstimate, first: Decision, masked: list[Span], known: NoiseEstimate | None = None
+) -> Decision:
     """Decide by figures that are estimated without spans which the figures found may mask.
 
     Parameters
     ----------
     first : by the figures found; it stands unless another has more evidence.
     masked : spans of fixes that are suspected besides those of the first.
+    known : an estimate that uses these; it stands where it explains the rest better, too.
     """
-    best, leading, estimate, spans, passes = first, found, found, masked, first.passes
+    best, estimate, spans, passes = first, found, masked, first.passes
     rival, gain = first.rival or first, np.inf  # rival: by other spans than segments
     start = NoiseModel(found.noise.figures, found.noise.times, excluded=dict.fromkeys(FIXES, tuple(masked)))
     for _ in range(_REFINEMENTS):
         estimate = estimate_noise(base, None, start, estimate.get_linearisation(base))
-        if spans is masked and np.isfinite(first.log_evidence):
+        if spans is masked and known is not None:
+            passes = passes + Counter(filter=1)
+            if estimate.log_evidence <= _weigh_beside(base, known, masked):
+                return replace(first, passes=passes + estimate.passes)
+        elif spans is masked and np.isfinite(first.log_evidence):
             gain = estimate.log_evidence - weigh_rest(base, found, estimate.noise.excluded)
             passes = passes + Counter(filter=1)
             if gain <= estimate.gained_by_chance:
@@ -262,18 +276,18 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
                 continue
             least = min(best.log_evidence, rival.log_evidence)
             candidate = explain(base, add_outliers(estimate, errors, some), some, least=least)
-            passes = passes + candidate.passes
+            candidate, passes = replace(candidate, estimate=estimate), passes + candidate.passes
             cut = cut_at_steps(some, candidate.noise, used, estimate)
             if cut != some:
                 among = list_explanations(candidate.noise)  # its pieces are wrong the same way, or not at all
                 finer = explain(base, add_outliers(estimate, errors, cut), cut, among, least)
-                passes = passes + finer.passes
+                finer, passes = replace(finer, estimate=estimate), passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
             most = max(most, candidate.log_evidence)
             if some is not segments and candidate.log_evidence > rival.log_evidence:
                 rival = candidate
             if candidate.log_evidence > best.log_evidence:
-                best, leading = candidate, estimate
+                best = candidate
         if sum_lengths(detected) > 2.0 * sum_lengths(masked):  # more fixes seem wrong outside the span than inside
             break
         if not refined:  # single outliers and no fault
@@ -285,10 +299,17 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         if not refined or refined == spans or first.log_evidence - most > gain:
             break
         spans, start = refined, replace(start, excluded=dict.fromkeys(FIXES, tuple(refined)))
-    if best is not first and not best.noise.excluded:  # the figures that go with these outliers
-        free = estimate_noise(base, None, best.noise, leading.get_linearisation(base))
+    if best.estimate is not None and not best.noise.excluded:  # the figures that go with these outliers
+        free = estimate_noise(base, None, best.noise, best.estimate.get_linearisation(base))
         return Decision(free.noise, best.log_evidence, passes + free.passes, free)
     return replace(best, passes=passes, rival=None if best is rival else rival)
+
+
+def _weigh_beside(base: Problem, known: NoiseEstimate, spans: list[Span]) -> float:
+    """The logarithm of the evidence that an estimate has of the measurements outside of some spans that it uses."""
+    excluded = dict(known.noise.excluded)
+    rest = weigh_rest(base, known, excluded | {name: (*excluded.get(name, ()), *spans) for name in FIXES})
+    return rest + log_evidence(base, known) - known.log_evidence
 
 
 def _use_all(base: Problem, first: Decision, estimate: NoiseEstimate, passes: Counter[str]) -> Decision:
@@ -339,6 +360,8 @@ def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
             return replace(free, passes=passes)
         if free.noise.excluded == found.noise.excluded:  # the same model, already converging
             start, near = free.noise, free.get_linearisation(base)
+        elif not _may_be_disturbed(base, found):
+            return replace(found, passes=passes)
     disturbed = weigh_evidence(base, estimate_noise(base, None, start, near, intervals=True))
     passes = passes + disturbed.passes
     if log_evidence(base, disturbed) <= log_evidence(base, found):

@@ -14,7 +14,7 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
-from graphnav.estimation.faults.watch import FAULT_COST, LARGE, MINUTE, SIZES
+from graphnav.estimation.faults.watch import FAULT_COST, LARGE, MINUTE, SIZES, is_large
 from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.noise.moments import compute_expected_squares, predict_errors
 from graphnav.estimation.noise.outliers import compute_row_costs
@@ -208,10 +208,9 @@ def compute_evidence(
 ) -> tuple[float, list[Explanation], int]:
     """Find the most probable explanation of each span, by the likelihood of the innovations.
 
-    Measurements that have an error in common may have outliers besides: where the innovations show that these could
-    decide, their weights are found by a smoother with that error, by steps of expectation-maximisation, none of which
-    lowers the log-probability (Lange, Little and Taylor 1989); not if all that they could gain would leave it below
-    `least`.
+    Measurements with an error in common may have outliers besides: where the innovations show that these could decide,
+    their weights are found by a smoother with that error, by steps of expectation-maximisation, none of which lowers
+    the log-probability (Lange, Little and Taylor 1989); not if all that they could gain would leave it below `least`.
 
     Spans are explained each by itself, up to the start of the next one. Where spans without a measurement between them
     have different explanations, the state at the second is not that of its model, so a filter with all that was chosen
@@ -236,10 +235,9 @@ def compute_evidence(
     int
         Filter passes.
     """
-    trials = Trials(problem, about, spans)
+    trials, before = Trials(problem, about, spans), 0.0
     models: list[_Model] = []
     common: list[tuple[_Model, Array]] = []
-    before = 0.0
     present = {rows.name for rows in problem.constraints}
     for j, kinds in enumerate(EXPLANATIONS):
         possible = present & set(kinds) if kinds == WHEELS else kinds == INTERVALS or present.issuperset(kinds)
@@ -268,7 +266,7 @@ def compute_evidence(
             cost = costs.explanations[:, EXPLANATIONS.index(model.kinds)] + more
             likelihood = trials.sum_spans(forward.log_likelihood)
             previous, model = model, _Model(model.kinds, base, model.common, likelihood, cost)
-            gain = model.value - previous.value  # less each time
+            gain = np.subtract(model.value, previous.value, out=0.0 * gain, where=np.isfinite(model.value))  # ever less
             models.append(model)
     value, chosen = trials.choose(models)
     return before + value, chosen, trials.passes
@@ -307,7 +305,8 @@ class Trials:
     def weigh_outliers(
         self, problem: Problem, kinds: Explanation, forward: ForwardRecord, tails: Mapping[str, float]
     ) -> tuple[Problem, Array]:
-        """The problem with weights for outliers among rows of some constraints, and what these cost in each span (M,).
+        """The problem with weights for outliers among rows of some constraints, and what these cost in each span (M,):
+        infinite where the error in common of fixes is not large, which is no fault, however certain.
 
         `forward` : of `filter_about`.
         """
@@ -323,9 +322,21 @@ class Trials:
                 rows = replace(rows, weight=weight)
             weighted.append(rows)
         problem = replace(problem, constraints=tuple(weighted))
-        others = [rows.name for rows in problem.constraints if rows.name not in kinds]
-        each = compute_row_costs(problem, tails, without=others)
-        return problem, np.array([np.sum(each[mask_times(problem.t, [span])]) for span in self._spans])
+        each = compute_row_costs(problem, tails, without={rows.name for rows in problem.constraints} - set(kinds))
+        cost = np.array([np.sum(each[mask_times(problem.t, [span])]) for span in self._spans])
+        return problem, np.where(self._list_large(kinds, split_values(common, smoothed)), cost, np.inf)
+
+    def _list_large(self, kinds: Explanation, values: Mapping[str, Array]) -> Array:
+        """(M,) in which spans the error in common of fixes is large, by its values (K, 2 m); of wheels, in all."""
+        fixes = [rows for rows in self._problem.constraints if rows.name in kinds and rows.fix_of]
+        out = np.full(len(self._spans), not fixes)
+        for k, (begin, end) in enumerate(self._spans):
+            inside = mask_times(self._problem.t, [(begin, end)])
+            speed = float(np.median(np.linalg.norm(self._states.v[inside], axis=1)))
+            for rows in fixes:
+                error, growth = np.split(values[f"{rows.name}_fault"][inside][0], 2)
+                out[k] |= any(is_large(error + dt / MINUTE * growth, rows, speed) for dt in (0.0, end - begin))
+        return out
 
     def choose(self, models: list[_Model]) -> tuple[float, list[Explanation]]:
         """The most probable explanation of each span, and the log-probability of all together, up to a constant."""
