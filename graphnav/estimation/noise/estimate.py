@@ -39,7 +39,7 @@ from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, ForwardRecord, MomentPass, are_near, reuse_points
-from graphnav.estimation.solvers.rows import compute_cost_at, shorten_step
+from graphnav.estimation.solvers.rows import descend
 from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
 
@@ -184,7 +184,7 @@ def _iterate(
             evidence = float(np.sum(latest[0].log_likelihood)) + prior_then - _compute_weight_cost(used, figures)
             ahead = _splice(about, latest[1])
             near, here = are_near(ahead, about, LINEAR_ATTITUDE), figures.copy()
-            about = ahead if near else _descend(used, about, ahead)
+            about = ahead if near else descend(used, about, ahead)
             gained = evidence - most
             if intervals and INTERVALS[0] not in here.weights:
                 pass  # another model than is asked for
@@ -241,14 +241,6 @@ def _compute_weight_cost(used: Problem, figures: Components) -> float:
     """By which the log-likelihood of a problem with the weights of these figures is above the evidence."""
     intervals = compute_interval_cost(figures.weights, len(used.t) - 1)
     return float(np.sum(compute_row_costs(used, figures.tails))) + intervals
-
-
-def _descend(problem: Problem, about: Points, ahead: Points) -> Points:
-    """Points ahead, or on the way there, that cost less; else those before."""
-    cost, beyond = (compute_cost_at(problem, points) for points in (about, ahead))
-    if not beyond < cost:
-        ahead, beyond = shorten_step(problem, about, ahead, cost, beyond)
-    return ahead if beyond < cost else about
 
 
 def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, MomentPass]:

@@ -18,6 +18,7 @@ from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, l
 from graphnav.estimation.solvers.passes import make_points, move_points, spread_nodes, subtract_points
 from graphnav.imu.dynamics import SCALE
 
+_SHORTENED = 3  # times that a step is quartered: to the 64th
 _SHARED_BLOCKS = 6  # blocks of rows with the same variables
 WhitenedRows = list[tuple[list[tuple[Array, Array]], Array]]  # blocks of (keys, A (N, m, k)), and b (N, m)
 
@@ -191,6 +192,19 @@ def shorten_step(problem: Problem, start: Points, ahead: Points, cost: float, lo
     nearer = move_points(start, (3.0 * cost - 4.0 * halfway + lower) / (4.0 * bend) * step)
     least = compute_cost_at(problem, nearer)
     return (nearer, least) if least < lower else (ahead, lower)
+
+
+def descend(problem: Problem, about: Points, ahead: Points) -> Points:
+    """The points ahead, or on the way there, that cost less than those before, or these where none do."""
+    cost, step = compute_cost_at(problem, about), subtract_points(ahead, about)
+    for share in 0.25 ** np.arange(_SHORTENED + 1.0):
+        points = ahead if share == 1.0 else move_points(about, share * step)
+        beyond = compute_cost_at(problem, points)
+        if not beyond < cost:
+            points, beyond = shorten_step(problem, about, points, cost, beyond)
+        if beyond < cost:
+            return points
+    return about
 
 
 def compute_column_norms(rows: WhitenedRows, layout: Layout) -> Array:
