@@ -30,7 +30,7 @@ from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.passes import make_points, move_points
 from graphnav.estimation.solvers.recursion import move_columns
 from graphnav.estimation.solvers.robust import weigh_squares
-from graphnav.estimation.solvers.rows import Layout, compute_cost_at, shorten_step, whiten
+from graphnav.estimation.solvers.rows import Layout, compute_cost_at, descend, whiten
 from graphnav.estimation.solvers.rts import rts, smooth_backward
 from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Recording
@@ -300,7 +300,7 @@ def test_steps_that_are_halved_reach_the_optimum_from_a_heading_that_is_far_off(
     points = move_points(optimum, away)
     costs = [compute_cost_at(problem, points)]
     for _ in range(20):
-        points = shorten_step(problem, points, smooth_backward(problem, refilter(problem, points)))
+        points = descend(problem, points, smooth_backward(problem, refilter(problem, points)))
         costs.append(compute_cost_at(problem, points))
     assert costs[0] > 100.0 * best
     assert np.all(np.diff(costs) <= 0.0)
