@@ -25,6 +25,7 @@ import numpy as np
 
 from graphnav.core.memory import read_peak_memory_mb
 from graphnav.core.progress import send_progress
+from graphnav.core.staging import defer_interrupts
 
 T = TypeVar("T")
 _LARGEST = 1500.0  # MB of peak memory up to which a second process is begun: it may need as much again
@@ -80,21 +81,22 @@ class Beside(Generic[T]):
 
     def __init__(self, work: Callable[[], T]) -> None:
         self._work, self._given = work, _list_arguments(work)
-        end, begin = os.pipe()
-        with warnings.catch_warnings():  # of other threads, which hold no lock that the work needs
-            warnings.simplefilter("ignore", DeprecationWarning)
-            try:
-                process = os.fork()
-            except OSError:
-                os.close(end)
-                os.close(begin)
-                raise
-        if not process:
-            _work_and_exit(work, self._given, begin)
-        os.close(begin)
-        self._end = end
         self._found: tuple[T, Exception | None]
-        self._stop = weakref.finalize(self, _stop, process, end)
+        with defer_interrupts():  # what Python calls at a fork, logging's locks, would lose them
+            end, begin = os.pipe()
+            with warnings.catch_warnings():  # of other threads, which hold no lock that the work needs
+                warnings.simplefilter("ignore", DeprecationWarning)
+                try:
+                    process = os.fork()
+                except OSError:
+                    os.close(end)
+                    os.close(begin)
+                    raise
+            if not process:
+                _work_and_exit(work, self._given, begin)
+            os.close(begin)
+            self._end = end
+            self._stop = weakref.finalize(self, _stop, process, end)
 
     def get_result(self) -> T:
         """Wait for the result; what the work raised is raised here.

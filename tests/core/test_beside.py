@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -142,6 +143,21 @@ def test_what_was_ended_is_done_here_if_it_is_wanted_after_all() -> None:
     work = begin_beside(os.getpid)
     work.end()
     assert work.get_result() == os.getpid()
+
+
+def test_an_interrupt_at_the_fork_is_not_lost() -> None:
+    """What Python calls at a fork, as logging has it do, loses what is raised in it."""
+    program = """if True:
+        import os, signal
+        from graphnav.core.beside import Beside
+        os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGINT))
+        try:
+            Beside(int)
+        except KeyboardInterrupt:
+            raise SystemExit(7)
+        """
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (7, "")
 
 
 def test_a_run_is_the_same_with_a_second_process(monkeypatch: pytest.MonkeyPatch) -> None:
