@@ -316,6 +316,8 @@ def test_on_a_full_disk_are_the_new_results_or_the_older(tmp_path, end):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_end_is_one_line_and_leaves_nothing_half_done(tmp_path, number):
     """On a terminal, as soon as the bar is up."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as of what a shell runs in the background
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     main, end = pty.openpty()
     command = [PROGRAM, "compare", "kitti", "-o", tmp_path / "out"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=end, stdin=subprocess.DEVNULL) as run:

@@ -150,6 +150,7 @@ def test_an_interrupt_at_the_fork_is_not_lost() -> None:
     program = """if True:
         import os, signal
         from graphnav.core.beside import Beside
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # where the tests run in the background, it is ignored
         os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGINT))
         try:
             Beside(int)
