@@ -92,8 +92,8 @@ def _find_blocks(tree: Tree, edge: float) -> list[Block]:
         until = newest if block is None else block.first
         while until - begin >= _BLOCK:
             end = int(begin) + _BLOCK
-            own = [x.key for x in reversed(variables) if x.first > begin and x.last < end]
-            slots = {i for key in own for i in index.at(key)}
+            own = [x for x in reversed(variables) if x.first > begin and x.last < end]
+            slots = {i for x in own for i in index.at(x.key)}
             out.append(Block(int(begin), end, own, slots, tree.linearise(slots)))
             begin = end
         if block is not None:
@@ -121,7 +121,7 @@ class Elimination:
         variables = sorted(tree.variables.values(), key=lambda x: x.first)
         self._own = sorted((x for x in variables if x.first < edge), key=lambda x: x.last)
         tree.blocks = _find_blocks(tree, edge)
-        inside = {key for block in tree.blocks for key in block.keys}
+        inside = {x.key for block in tree.blocks for x in block.variables}
         self._behind = [x for x in variables if x.first >= edge and x.key not in inside]
         slots = set[int]().union(*(block.slots for block in tree.blocks))
         self._graph = tree.linearise(i for i in range(tree.isam.getFactorsUnsafe().size()) if i not in slots)

@@ -83,16 +83,14 @@ class Block:
 
     first: int  # numbers of the two
     last: int
-    keys: list[int]  # variables that nothing else touches, in the order of their elimination
+    variables: list[Variable]  # that nothing else touches, in the order of their elimination
     slots: set[int]  # indices of all factors on them
     graph: gtsam.GaussianFactorGraph  # these, or what is left of them
     done: bool = False
 
     def eliminate(self) -> None:
         """Leave only what is said of others."""
-        order = gtsam.Ordering()
-        for key in self.keys:
-            order.push_back(key)
+        order = fill_keys(gtsam.Ordering(), self.variables)
         self.graph, self.done = self.graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1], True
 
 

@@ -21,7 +21,7 @@ _FAR = 10.0  # periods; rows that overtake each other are closer
 _SET_BACK = 3.0  # periods, of a clock; times are then there twice, and not only out of order
 _TWICE = 1.5  # rows to a period above which, between one and two, a time is there twice
 _CLOSE = 0.3  # of the mean step, below which two rows were read at once
-_SPAN = 200  # rows over which their mean step is measured, more than a packet has
+_PAUSE = 1.0  # s; longer steps of an IMU are gaps
 _GAP = 2.0  # median times between packets, from which on rows are lost
 _PACKETS = 1 / 3  # share of such steps from which on rows come in packets: of one and two in turn, or more
 _ROUNDED_AWAY = 0.05  # share of the stamps that repeat the one before, where a rounding makes them
@@ -79,12 +79,10 @@ def spread_packets(t: Array, repeats: NDArray[np.bool_]) -> tuple[Array, float] 
     t : (N,) s, in order.
     repeats : (N-1,) whether a row holds what the one before does, which is then no measurement of its own.
     """
-    n = len(t)
-    if n < 2 or np.array_equal(t, np.floor(t)):
+    n, step = len(t), np.diff(t)
+    if not (step < _PAUSE).any() or np.array_equal(t, np.floor(t)):
         return None
-    span = min(_SPAN, n - 1)
-    usual = float(np.median(t[span:] - t[: n - span])) / span
-    close = (np.diff(t) < _CLOSE * usual) & ~repeats
+    close = (step < _CLOSE * np.mean(step[step < _PAUSE])) & ~repeats
     if np.count_nonzero(close) < _PACKETS * n:
         return None
     last = np.append(np.flatnonzero(~close), n - 1)
@@ -92,7 +90,9 @@ def spread_packets(t: Array, repeats: NDArray[np.bool_]) -> tuple[Array, float] 
         return None
     first, count, takes = int(last[0]), np.diff(last), np.diff(t[last])
     whole = takes < _GAP * np.median(takes)
-    usual = float(takes[whole].sum()) / max(int(count[whole].sum()), 1)
+    usual = float(np.sum(takes[:-1], where=whole[:-1])) / max(int(np.sum(count[:-1], where=whole[:-1])), 1)
+    if not usual > 0.0:  # of the last packet, there may be a part only
+        usual = float(takes[-1]) / int(count[-1])
     out = np.interp(np.arange(n), last, t[last])
     out[:first] = t[first] - usual * np.arange(first, 0, -1)
     for k in np.flatnonzero(~whole & (takes > _GAP * usual * count)).tolist():
