@@ -15,6 +15,7 @@ from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
+from graphnav.detectors import detect
 from graphnav.estimation.alignment import Alignment, align, motion, use_known_heading
 from graphnav.recording import Recording
 
@@ -22,8 +23,8 @@ DEG = np.pi / 180.0
 
 
 def aligned(recording: Recording, settings: Settings | None = None) -> tuple[Alignment, LocalFrame]:
-    frame = LocalFrame(recording.gnss.llh[0])
-    return align(recording, settings or Settings(), frame), frame
+    frame, settings = LocalFrame(recording.gnss.llh[0]), settings or Settings()
+    return align(recording, settings, frame, detect(recording, settings).stationary), frame
 
 
 def judged(recording: Recording, truth: Trajectory, body: Array | None = None) -> tuple[Array, Array, Array]:
@@ -69,6 +70,17 @@ def test_a_drive_cut_in_motion(path: oracle.ExactPath, begin: float, sd: tuple[f
     recording, truth = oracle.drive(path, seed=2, gnss_sd=sd)
     assert path.speed[round(begin / path.dt)] > 3.0
     assert_good(*judged(recording.crop(begin), truth))
+
+
+def test_a_steady_drive_before_its_first_fix_is_no_stand(path: oracle.ExactPath) -> None:
+    """The IMU of a car at constant speed reads what it reads at rest."""
+    recording, truth = oracle.drive(path, seed=2)
+    speed, size = path.speed, round(10.0 / path.dt)  # of a window that starts at each time
+    steady = np.lib.stride_tricks.sliding_window_view(speed, size)
+    begin = float(path.dt * np.argmax((np.ptp(steady, axis=1) < 0.1) & (steady.min(axis=1) > 5.0)))
+    assert begin > 0.0
+    part = recording.crop(begin)
+    assert_good(*judged(part.without("gnss", (0.0, 15.0)), truth))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -180,8 +192,8 @@ def test_a_recording_at_rest_is_levelled_and_its_heading_unknown(path: oracle.Ex
 
 def test_without_gnss_heading_and_position_count_from_zero(path: oracle.ExactPath) -> None:
     recording, _ = oracle.drive(path, seed=0)
-    frame = LocalFrame(recording.gnss.llh[0])
-    found = align(recording.without("gnss"), Settings(), frame)
+    blind = recording.without("gnss")
+    found = align(blind, Settings(), LocalFrame(recording.gnss.llh[0]), detect(blind, Settings()).stationary)
     assert found.rph[2] == pytest.approx(0.0)
     assert found.sigma[2] < 1e-3
     np.testing.assert_array_equal(found.state.p, 0.0)

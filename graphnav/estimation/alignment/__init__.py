@@ -63,7 +63,7 @@ def align(
     if span is None:
         return level_at_rest(recording, settings, frame, stationary)
     minima = () if before is None else before.minima
-    return replace(align_in_motion(recording, settings, frame, span, minima), motion=span[0], until=span[1])
+    return replace(align_in_motion(recording, settings, frame, span, stationary, minima), motion=span[0], until=span[1])
 
 
 def is_ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:
@@ -71,7 +71,7 @@ def is_ready(recording: Recording, settings: Settings, stationary: Array | None 
 
     Parameters
     ----------
-    stationary : as for `align`; None where stops have not been detected yet; a quiet IMU alone stands for them then.
+    stationary : as for `align`; None where stops have not been detected yet: it may stand throughout.
     """
     span = find_motion_span(drop_implausible(recording), settings, NONE if stationary is None else stationary)
     if span is None:

@@ -11,7 +11,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.dual_antenna import SENSOR
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
-from graphnav.estimation.alignment.back import find_stand_end
+from graphnav.estimation.alignment.back import find_first_stop_end
 from graphnav.estimation.alignment.first import level
 from graphnav.recording import Recording
 
@@ -37,7 +37,7 @@ def measure_baseline_heading(
 
     Parameters
     ----------
-    stationary : (N, 2) s, intervals in which it stands; None: unknown, and a quiet IMU whose wheels do not turn stands.
+    stationary : (N, 2) s, intervals in which it stands; None: unknown, and it may stand throughout.
 
     Returns
     -------
@@ -47,11 +47,8 @@ def measure_baseline_heading(
     series = recording.sensors.get(SENSOR.name)
     if recording.platform != "vehicle" or series is None or not settings.get_sensor(SENSOR.name).use:
         return None
-    begin, first = recording.start, float(recording.imu.t[0]) + SAME_TIME
-    if stationary is None:
-        end = find_stand_end(recording, recording.end)
-    else:
-        end = float(max((b for a, b in stationary if a <= first), default=begin))
+    begin = recording.start
+    end = recording.end if stationary is None else find_first_stop_end(recording, stationary)
     rows = (series.t >= begin - SAME_TIME) & (series.t <= end + SAME_TIME) & np.isfinite(series["heading"])
     if end <= begin or np.count_nonzero(rows) < _FEWEST_READINGS:
         return None

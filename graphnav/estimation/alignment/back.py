@@ -10,7 +10,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
-from graphnav.estimation.alignment.first import STANDING, Alignment
+from graphnav.estimation.alignment.first import LEVELLING, STANDING, Alignment
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import integrate_prefix
 from graphnav.imu.samples import Samples, bridge_gaps
@@ -28,6 +28,7 @@ def carry_back(
     wide: Array,
     own: Array,
     begin: float,
+    stationary: Array,
     notes: tuple[str, ...],
 ) -> Alignment:
     """Carry the state back from the start of the short problem to the first sample of the recording."""
@@ -38,7 +39,7 @@ def carry_back(
     sd_bg = sd[12:15]
     sd_p, sd_v = np.full(3, 1.0) + 10.0 * sd[3:6], np.full(3, 0.5) + 10.0 * sd[6:9]
     if begin - recording.start > 0.05:
-        still, samples = find_stand_end(recording, begin), bridge_gaps(imu)
+        still, samples = min(_find_stand_end(recording, stationary, begin), begin), bridge_gaps(imu)
         stood, back = still - recording.start, begin - still
         drift = np.zeros(3)
         if back > 0.05:
@@ -81,15 +82,29 @@ def carry_back(
     return Alignment(state, np.minimum(sigma, np.r_[[np.pi] * 3, [1e6] * 12]), own, notes)
 
 
-def find_stand_end(recording: Recording, end: float) -> float:
-    """End of the initial span with nothing but vibration: one-second means hardly differ. The start if there is none.
+def find_first_stop_end(recording: Recording, stationary: Array) -> float:
+    """End (s) of the stop that a recording begins with, of `stationary` (N, 2) s; its start where there is none."""
+    first = recording.start + LEVELLING
+    return float(max((b for a, b in stationary if a <= first), default=recording.start))
 
-    The last second before the first that differs is left out as well, as motion may have begun in it. A steady drive
-    shakes no more than an idle engine: it does not stand where its wheels turn.
+
+def _find_stand_end(recording: Recording, stationary: Array, begin: float) -> float:
+    """End (s) of the stand at the start: by the detectors, or, where no fix from the start on shows motion before
+    `begin`, as far as the IMU is quiet. That alone is no stand: a steady drive shakes no more than an idle engine.
     """
-    imu, odometer, start = recording.imu, recording.odometer, recording.start
-    if odometer is not None and (turning := np.abs(odometer.speed) > STANDING).any():
-        end = min(end, float(odometer.t[np.argmax(turning)]))
+    gnss, detected = recording.gnss, find_first_stop_end(recording, stationary)
+    if gnss is None or not len(gnss.t) or gnss.t[0] > recording.start + LEVELLING:
+        return detected
+    return max(detected, _find_quiet_end(recording, begin))
+
+
+def _find_quiet_end(recording: Recording, end: float) -> float:
+    """End (s) of the initial span with nothing but vibration: one-second means hardly differ. The start if there is
+    none.
+
+    The last second before the first that differs is left out as well, as motion may have begun in it.
+    """
+    imu, start = recording.imu, recording.start
     rows = imu.t <= end
     blocks = max(1, int(end - start))
     size = np.count_nonzero(rows) // blocks

@@ -13,6 +13,7 @@ from graphnav.core.state import States
 from graphnav.recording import Gnss, Recording
 
 STANDING = 0.5  # m/s, of a vehicle that is taken to stand
+LEVELLING = 1.0  # s at the start over which the specific force is averaged
 _SIGMAS = 3.0
 
 
@@ -40,7 +41,7 @@ class Alignment:
         return bool(np.any(np.abs(off) > _SIGMAS * sigma))
 
 
-def level(recording: Recording, begin: float, seconds: float = 1.0) -> Array:
+def level(recording: Recording, begin: float, seconds: float = LEVELLING) -> Array:
     """(roll, pitch) from the mean specific force after `begin`, rad."""
     imu = recording.imu
     f = imu.accel[(imu.t > begin) & (imu.t <= begin + seconds)]

@@ -126,11 +126,13 @@ def align_in_motion(
     settings: Settings,
     frame: LocalFrame,
     span: tuple[float, float],
+    stationary: Array = NONE,
     minima: Sequence[States] = (),
 ) -> Alignment:
     """The first state from the short problem over `span` (s), carried back to the first sample.
 
-    `minima` are those of nearly the same problem, tried in place of initial headings if there are as many keyframes.
+    The platform stands in the intervals `stationary` (N, 2) s. `minima` are those of nearly the same problem, tried in
+    place of initial headings if there are as many keyframes.
     """
     gnss, imu = recording.gnss, recording.imu
     assert gnss is not None
@@ -179,7 +181,7 @@ def align_in_motion(
         *notes,
     )
     found = tuple({id(one): one.states for one in tried}.values())
-    return replace(carry_back(recording, settings, best, R, wide, own, begin, notes), minima=found)
+    return replace(carry_back(recording, settings, best, R, wide, own, begin, stationary, notes), minima=found)
 
 
 def _fit_heading(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:

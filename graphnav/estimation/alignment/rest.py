@@ -12,8 +12,8 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment.antennas import measure_baseline_heading
-from graphnav.estimation.alignment.back import find_stand_end
-from graphnav.estimation.alignment.first import STANDING, Alignment, level
+from graphnav.estimation.alignment.back import find_first_stop_end
+from graphnav.estimation.alignment.first import LEVELLING, STANDING, Alignment, level
 from graphnav.imu.preintegration import integrate_prefix
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
@@ -50,7 +50,7 @@ def level_at_rest(recording: Recording, settings: Settings, frame: LocalFrame, s
         if abs(speed) > STANDING:
             tilt += felt / 9.8  # levelling takes it for gravity
             v, sd_v = speed * R[:, 1], STANDING + abs(speed) * settings.alignment.prior_inflation * tilt
-        elif recording.platform == "vehicle" and not speed and find_stand_end(recording, recording.end) <= begin:
+        elif recording.platform == "vehicle" and not speed and find_first_stop_end(recording, stationary) <= begin:
             sd_v = _DRIVING
             note = Note(
                 "alignment.speed_unknown",
@@ -121,5 +121,5 @@ def _find_stand(recording: Recording, stances: Array) -> tuple[float, float]:
     """
     if len(stances) and stances[0, 0] > recording.start + _FIRST_STANCE:
         length = float(stances[0, 1] - stances[0, 0])
-        return float(stances[0, 0]) + 0.25 * length, min(1.0, 0.5 * length)
-    return recording.start, 1.0
+        return float(stances[0, 0]) + 0.25 * length, min(LEVELLING, 0.5 * length)
+    return recording.start, LEVELLING
