@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from graphnav.recording import Imu
 from graphnav.recording.formats.stamps import find_repeats, spread_packets
+from graphnav.recording.plausibility.screening import spread_rows_read_at_once
 
 PERIOD = 0.01
 T = 100.0 + PERIOD * np.arange(3000)
@@ -63,3 +65,13 @@ def test_a_log_that_writes_rows_twice_has_no_packets() -> None:
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_too_few_rows(n: int) -> None:
     assert spread_packets(T[:n], NEW[: max(n - 1, 0)]) is None
+
+
+def test_packets_of_a_recording_made_by_a_program() -> None:
+    """Those of files are spread by their reader."""
+    x = np.random.default_rng(0).standard_normal((len(T), 3))
+    imu = Imu(stamp_on_reading(T, 0.05), x, x)
+    spread, findings = spread_rows_read_at_once(imu)
+    assert [finding.key for finding in findings] == ["imu.packets"]
+    assert np.ptp(np.diff(spread.t)[10:-10]) < 0.5 * PERIOD
+    assert spread_rows_read_at_once(Imu(T, x, x))[0].t is T

@@ -17,6 +17,7 @@ from graphnav.recording.formats.stamps import (
     check_fix_clock,
     check_imu_steps,
     check_passes,
+    describe_packets,
     find_lone_stamps,
     find_repeated,
     find_repeats,
@@ -131,8 +132,7 @@ def select_usable_rows(
     if sensor == "imu" and (spread := spread_packets(t, find_repeats(rows.columns))) is not None:
         remarks.add(
             "imu.packets",
-            f"{spread[1]:.3g} IMU rows in the mean have one stamp, or nearly, as a program reads them at once: taken "
-            f"to be evenly between these{tell_rounding(stamps, np.r_[False, step == 0.0])}",
+            f"{describe_packets(spread[1])}{tell_rounding(stamps, np.r_[False, step == 0.0])}",
         )
         t = spread[0]
         rows = rows.with_column("t", t)

@@ -60,10 +60,11 @@ def find_repeated(where: str, t: Array) -> NDArray[np.bool_]:
 
 
 def find_repeats(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
-    """(N-1,) whether a row holds the same as the one before, apart from its time."""
+    """(N-1,) whether a row of columns (N,) or (N, k) holds the same as the one before, apart from its time."""
     same = np.ones(max(len(columns["t"]) - 1, 0), dtype=bool)
-    for x in (column for name, column in columns.items() if name != "t"):
-        same &= (x[1:] == x[:-1]) | (np.isnan(x[1:]) & np.isnan(x[:-1]))
+    for name, column in columns.items():
+        for x in column.reshape(len(column), -1).T if name != "t" else ():
+            same &= (x[1:] == x[:-1]) | (np.isnan(x[1:]) & np.isnan(x[:-1]))
     return same
 
 
@@ -99,6 +100,14 @@ def spread_packets(t: Array, repeats: NDArray[np.bool_]) -> tuple[Array, float] 
         at = np.arange(last[k] + 1, last[k + 1])
         out[at] = t[last[k + 1]] - usual * (last[k + 1] - at)
     return out, n / len(last)
+
+
+def describe_packets(size: float) -> str:
+    """A sentence on rows that come in packets, of a mean size."""
+    return (
+        f"{size:.3g} IMU rows in the mean have one stamp, or nearly, as a program reads them at once: taken to be "
+        "evenly between these"
+    )
 
 
 def check_days(rows: Table, unit: str) -> None:

@@ -28,6 +28,7 @@ from graphnav.recording.checks.series import screen_series
 from graphnav.recording.checks.tilt import NEAR_FACTOR
 from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.schema import FORCE
+from graphnav.recording.formats.stamps import describe_packets, find_repeats, spread_packets
 from graphnav.recording.plausibility import fixes as plausibility_gnss
 from graphnav.recording.plausibility import odometer as plausibility_odometer
 from graphnav.recording.plausibility.filled import describe_filled, find_filled
@@ -163,12 +164,14 @@ def screen(recording: Recording, rows: ScreenedRows | None = None) -> Screened:
 
 def screen_rows(recording: Recording) -> ScreenedRows:
     """The recording without impossible rows, findings on the IMU and on the others, and the track by the fixes."""
+    imu, packets = spread_rows_read_at_once(recording.imu)
+    recording = replace(recording, imu=imu)
     of_imu: list[Finding] = list(check_imu_scale(recording))
     if not of_imu:  # where a unit is wrong throughout, single rows cannot be judged
         imu, spikes = drop_spikes(recording.imu, recording.start)
         imu, filled = drop_filled(imu, recording.start)
         imu, contradicted = drop_contradicted(imu, recording.start, forces=recording.platform != "foot")
-        recording, of_imu = replace(recording, imu=imu), [*spikes, *filled, *contradicted]
+        recording, of_imu = replace(recording, imu=imu), [*packets, *spikes, *filled, *contradicted]
     recording, of_aiding = screen_series(replace(recording, screened=True))
     track = None
     if recording.gnss is not None and len(recording.gnss.t):
@@ -182,6 +185,14 @@ def screen_rows(recording: Recording) -> ScreenedRows:
         recording, more = plausibility_odometer.screen_odometer(recording, track)
         of_aiding += more
     return recording, of_imu, of_aiding, track
+
+
+def spread_rows_read_at_once(imu: Imu) -> tuple[Imu, list[Finding]]:
+    """The IMU with rows evenly between the times at which a program read several at once, as readers of files do."""
+    repeats = find_repeats({"gyro": imu.gyro, "accel": imu.accel, "t": imu.t})
+    if (spread := spread_packets(imu.t, repeats)) is None:
+        return imu, []
+    return replace(imu, t=spread[0]), [Finding("note", describe_packets(spread[1]), "imu.packets")]
 
 
 def check_imu_scale(recording: Recording) -> Iterator[Finding]:
