@@ -17,6 +17,7 @@ from graphnav.constraints.raw_phase import GnssPhase
 from graphnav.core.beside import Beside, Later
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
+from graphnav.core.notes import Note
 from graphnav.core.progress import tell
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS
@@ -84,10 +85,20 @@ class ProblemBuilder:
     false_stops: Array = field(
         default_factory=lambda: NONE
     )  # (n, 2) s, in which the platform moves, whatever the detectors say
+    notes: tuple[str, ...] = ()  # of its problems
 
     def use_spaced(self, recording: Recording, spacing: float) -> ProblemBuilder:
         """The same with the fixes of a recording, thinned to one in `spacing` (s); as they are where that is 0."""
-        return replace(self, used=space_fixes(recording, spacing) if spacing else recording)
+        used = space_fixes(recording, spacing) if spacing else recording
+        notes: tuple[str, ...] = ()
+        if used.gnss is not None and recording.gnss is not None and len(used.gnss.t) < len(recording.gnss.t):
+            few, all_ = len(used.gnss.t), len(recording.gnss.t)
+            notes = (
+                Note(
+                    "gnss.spaced", f"gnss: {few} of {all_} fixes used, the best of every {spacing:g} s (noise.spacing)"
+                ),
+            )
+        return replace(self, used=used, notes=notes)
 
     def align(self, recording: Recording, stationary: Array, before: Alignment | None = None) -> Alignment:
         """The first state of the recording, or of a part of it, near that found before, if any."""
@@ -112,6 +123,7 @@ class ProblemBuilder:
             # linearised at an arbitrary heading, a direction of travel would make an unknown heading appear known
             rows = tuple(c for c in problem.constraints if not c.of_wheels)
             problem = replace(problem, constraints=rows)
+        problem = replace(problem, notes=(*self.notes, *problem.notes))
         problem, carriers = split_carriers(problem, GnssPhase)  # the noise model depends on the codes
         return BuiltProblem(problem, carriers, aligned, detections)
 
