@@ -8,6 +8,9 @@ that the recording states and every fix used, once with the defaults. Errors are
 it has none, against spans of fixes that are withheld. Rows go to the file as they come, and those that are there
 already are not solved again. Exit code 1 where a bound of `BOUNDS` is broken.
 
+With `--changed backwards`, or another of `drive_changes.CHANGES`, each window is changed first: drives that nobody has
+seen, with the errors of real sensors.
+
 With `--online window` or `--online isam2` each recording comes row by row instead: what is known at once takes the
 filter's place, what settles the smoother's.
 """
@@ -29,6 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from drive_changes import CHANGES
 from harm_verdict import BOUNDS, FLOOR, OF_ESTIMATED, ONLINE, Row, broken, compared, failures, key_of, metres, table
 from online_tracks import Track, run_online
 from scipy.stats import chi2
@@ -105,18 +109,27 @@ class Job:
     sensors: str
     variant: str
     engine: str | None = None  # online
+    change: str | None = None  # of `drive_changes.CHANGES`
 
     @property
     def solvers(self) -> tuple[str, ...]:
         return ONLINE if self.engine else SOLVERS
 
     def key(self, solver: str) -> tuple[str, ...]:
-        return self.drive, self.window, self.sensors, self.variant, solver
+        drive = f"{self.drive} {self.change}" if self.change else self.drive
+        return drive, self.window, self.sensors, self.variant, solver
 
 
 @lru_cache(maxsize=1)
 def load(source: str) -> Recording:
     return graphnav.load(source)
+
+
+@lru_cache(maxsize=1)
+def cut(source: str, span: Span, change: str | None) -> Recording:
+    """A window of a drive, changed."""
+    part = load(source).crop(*span)
+    return CHANGES[change](part) if change else part
 
 
 def placed(drive: Drive, folder: Path) -> str:
@@ -155,7 +168,8 @@ def plan(options: argparse.Namespace) -> list[Job]:
         for window, span in windows(recording, DRIVES[name].source, options):
             sets = SENSORS if recording.odometer is not None else SENSORS[:2]
             cells += [
-                [Job(name, source, window, span, sensors, v, options.online) for v in VARIANTS] for sensors in sets
+                [Job(name, source, window, span, sensors, v, options.online, options.changed) for v in VARIANTS]
+                for sensors in sets
             ]
     if options.share < 1.0:
         picked = random.Random(options.seed).sample(range(len(cells)), max(1, round(options.share * len(cells))))
@@ -174,17 +188,17 @@ def withheld_of(part: Recording, length: float) -> tuple[Withheld, ...]:
 
 def solve(job: Job) -> list[Row]:
     """The rows of a job, by solver; with what went wrong in place of numbers where it cannot be solved."""
-    drive, whole = DRIVES[job.drive], load(job.source)
+    drive = DRIVES[job.drive]
     names = ("drive", "window", "sensors", "variant", "solver")
     rows: list[Row] = [
         {**dict(zip(names, job.key(solver), strict=True)), "simulated": drive.simulated} for solver in job.solvers
     ]
     began = time.process_time()
     try:
-        part = whole.crop(*job.span)
+        part = cut(job.source, job.span, job.change)
         if job.sensors != "+odometer" and part.odometer is not None:
             part = part.without("odometer")
-        withheld = withheld_of(part, whole.duration) if part.truth is None else ()
+        withheld = withheld_of(part, load(job.source).duration) if part.truth is None else ()
         used = part
         for source, span in withheld:
             used = used.without(source, span)
@@ -285,6 +299,7 @@ def options_of(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--share", type=float, default=1.0, help="of all cells, drawn by the seed")
     parser.add_argument("--seed", type=int, default=1, help="of where windows start, and of the share")
     parser.add_argument("--only", choices=VARIANTS, help="solve with one noise only")
+    parser.add_argument("--changed", choices=tuple(CHANGES), help="each window in this way")
     parser.add_argument("--online", choices=("window", "isam2"), help="row by row, with this engine")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--compare", type=Path, metavar="OLD.json", help="the rows of an earlier run")

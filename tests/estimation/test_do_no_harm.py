@@ -10,12 +10,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import oracle
 import pytest
 from helpers import forget_residuals
 
 import graphnav
 from graphnav.core.earth import LocalFrame
 from graphnav.estimation.solution import ExcludedSpan
+from graphnav.evaluation.evaluate import evaluate_recording
+from graphnav.evaluation.metrics import summarise
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -25,7 +28,7 @@ def script():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(SCRIPTS))
         yield importlib.import_module("do_no_harm")
-        for name in ("do_no_harm", "harm_verdict"):
+        for name in ("do_no_harm", "harm_verdict", "drive_changes"):
             sys.modules.pop(name)
 
 
@@ -315,3 +318,58 @@ def test_every_constant_is_changed_where_it_is_used(script) -> None:
             with constants.changed(constant, value):
                 assert getattr(module, constant.name) == value != usual
         assert getattr(module, constant.name) is usual
+
+
+# ------------------------------------------------------------------------------------------------------ changed drives
+@pytest.fixture(scope="module")
+def changes(script):
+    return sys.modules["drive_changes"].CHANGES
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return oracle.drive(oracle.vehicle_path(duration=120, rate=100.0, seed=2), seed=1)[0]
+
+
+def test_a_drive_that_is_turned_back_is_a_drive(changes, drive):
+    """On the path of the truth, and the Earth turns the same way."""
+    solved = graphnav.run(changes["backwards"](drive), solvers=("rts",), noise="stated")["rts"]
+    forwards = graphnav.run(drive, solvers=("rts",), noise="stated")["rts"]
+    errors = [
+        evaluate_recording(one.trajectory(), what)
+        for one, what in ((solved, changes["backwards"](drive)), (forwards, drive))
+    ]
+    back, usual = (summarise(one) for one in errors)
+    assert back["h_rms_m"] < 1.5 * usual["h_rms_m"]
+    assert back["heading_rms_deg"] < 3.0 * usual["heading_rms_deg"]
+    assert back["nees_p"] < 2.0
+
+
+def test_turned_back_twice_it_is_as_it_was(changes, drive):
+    again = changes["backwards"](changes["backwards"](drive))
+    assert again.imu.t == pytest.approx(drive.imu.t)
+    np.testing.assert_allclose(again.imu.gyro, drive.imu.gyro, atol=2e-6)
+    np.testing.assert_allclose(again.imu.accel, drive.imu.accel, atol=1e-4)
+    np.testing.assert_allclose(again.gnss.llh, drive.gnss.llh)
+    np.testing.assert_allclose(
+        np.unwrap(again.truth.rph, axis=0) - np.unwrap(drive.truth.rph, axis=0),
+        [[0, 0, 2 * np.pi]] * len(drive.truth.t),
+        atol=1e-9,
+    )
+
+
+def test_wheels_and_arms_are_turned_back(changes, tokyo):
+    back = changes["backwards"](tokyo)
+    np.testing.assert_array_equal(back.odometer.speed, tokyo.odometer.speed[::-1])
+    assert back.start + back.end - back.odometer.t[0] == pytest.approx(tokyo.odometer.t[-1])
+    np.testing.assert_array_equal(back.gnss.lever_arm[:2], -tokyo.gnss.lever_arm[:2])
+    np.testing.assert_array_equal(back.gnss.v, -tokyo.gnss.v[::-1])
+
+
+def test_fewer_fixes_and_a_slower_imu(changes, drive):
+    assert changes["blind-start"](drive).gnss.t[0] > drive.start + 20.0
+    assert np.diff(changes["sparse-fixes"](drive).gnss.t) == pytest.approx(8.0)
+    slow = changes["slow-imu"](drive).imu
+    assert slow.period == pytest.approx(5.0 * drive.imu.period)
+    np.testing.assert_allclose(slow.gyro[7], drive.imu.gyro[35:40].mean(axis=0))
+    assert slow.t[7] == drive.imu.t[39]
