@@ -36,6 +36,7 @@ from graphnav.estimation.noise.priors import get_prior
 from graphnav.estimation.noise.scales import are_scales_contradicted
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.passes import carry_points
 from graphnav.imu.dynamics import PRIORS
 
 
@@ -106,28 +107,37 @@ def begin_jointly(
     settings: GnssSettings,
     opening: float | None = None,
     progress: Progress | None = None,
-    start: NoiseModel | None = None,
 ) -> JointEstimate:
-    """The same with all measurements; what is given is as for `estimate_jointly`.
-
-    Parameters
-    ----------
-    start : initial figures, of nearly the same measurements.
-    """
-    return free_contradicted(estimate_as_stated(stated, opening, progress, start), settings, opening, progress)
+    """The same with all measurements; what is given is as for `estimate_jointly`."""
+    return free_contradicted(estimate_as_stated(stated, opening, progress), settings, opening, progress)
 
 
 def estimate_as_stated(
-    stated: Problem, opening: float | None = None, progress: Progress | None = None, start: NoiseModel | None = None
+    stated: Problem, opening: float | None = None, progress: Progress | None = None
 ) -> JointEstimate:
     """The same with all constants as stated."""
-    first = estimate_noise(stated, opening, start, progress=progress)
+    first = estimate_noise(stated, opening, progress=progress)
     other = _estimate_with_worse_imu(stated, first, opening, progress)
     if other is None:
         return JointEstimate(stated, {}, first)
     if other.log_evidence <= first.log_evidence + first.gained_by_chance:
         return JointEstimate(stated, {}, replace(first, passes=first.passes + other.passes))
     return JointEstimate(stated, {}, other, rival=JointEstimate(stated, {}, first))
+
+
+def estimate_moved(stated: Problem, found: JointEstimate, progress: Progress | None = None) -> JointEstimate:
+    """The same of a drive with its stamps moved, from figures and points of the estimate before: all but offsets.
+
+    Parameters
+    ----------
+    found : with other stamps. Where no worse IMU was likelier, none is with better ones.
+    """
+    best, before = found.estimate, found.base
+    start = NoiseModel(best.noise.figures, best.noise.times, tails=best.noise.tails)
+    moved = apply_noise(stated, start)
+    offsets = TIME_OFFSET, VELOCITY_TIME_OFFSET, CLOCK_RATE
+    near = carry_points(best.points, apply_noise(before, best.noise), moved, offsets)
+    return JointEstimate(stated, {}, estimate_noise(stated, None, start, (near, moved), progress))
 
 
 def free_contradicted(

@@ -26,6 +26,7 @@ from graphnav.estimation.joint_estimate import (
     JointEstimate,
     begin_jointly,
     estimate_as_stated,
+    estimate_moved,
     free_contradicted,
     leave_out_jointly,
     revise_jointly,
@@ -49,27 +50,26 @@ Estimated = tuple[BuiltProblem, JointEstimate]  # a problem and the estimate on 
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
-def begin_noise(
-    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, start: NoiseModel | None = None
-) -> Estimated:
+def begin_noise(builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None) -> Estimated:
     """The problem and its noise model of all measurements.
 
     Parameters
     ----------
     built : without the false stops of the builder.
-    start : initial figures, of nearly the same measurements.
 
     Raises
     ------
     EstimationError
         If the filter breaks down.
     """
-    return free_wrong_constants(builder, estimate_first(built, progress, start), progress)
+    return free_wrong_constants(builder, estimate_first(built, progress), progress)
 
 
-def estimate_first(built: BuiltProblem, progress: Progress | None, start: NoiseModel | None = None) -> Estimated:
-    """The same with all constants as stated."""
-    return built, estimate_as_stated(built.problem, built.aligned.until, progress, start)
+def estimate_first(built: BuiltProblem, progress: Progress | None, before: JointEstimate | None = None) -> Estimated:
+    """The same with all constants as stated; `before` is the estimate with other stamps, if any."""
+    if before is not None:
+        return built, estimate_moved(built.problem, before, progress)
+    return built, estimate_as_stated(built.problem, built.aligned.until, progress)
 
 
 def free_wrong_constants(builder: ProblemBuilder, first: Estimated, progress: Progress | None) -> Estimated:

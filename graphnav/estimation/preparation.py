@@ -145,14 +145,6 @@ class Begun:
         """As of `NoiseEstimate`."""
         return 0.0 if self.found is None else self.found.estimate.gained_by_chance
 
-    @property
-    def figures(self) -> NoiseModel | None:
-        """The figures of the estimate so far, to begin another with."""
-        if self.found is None:
-            return None
-        best = self.found.estimate.noise
-        return NoiseModel(best.figures, best.times, tails=best.tails)
-
     def weigh_measurements(self, some: Mapping[str, tuple[Span, ...]]) -> float:
         """By how much the logarithm of the evidence falls without rows at some times, by constraint."""
         assert self.found is not None
@@ -187,7 +179,7 @@ def begin_preparation(
     ----------
     detections : where the platform stands.
     noise : used as it is; when None it is estimated, or stated, according to the settings.
-    before : what was begun with nearly the same recording: its figures, and false stops, are initial ones.
+    before : what was begun with other stamps: its figures, points and false stops are initial ones.
 
     Raises
     ------
@@ -225,7 +217,7 @@ def begin_preparation(
         return Begun(recording, unmeasured, builder, built, noise, None, spacing, larger, passes)
     tell("noise")
     with clock.count_time("noise"):
-        one = estimate_first(built, progress, None if before is None else before.figures)
+        one = estimate_first(built, progress, None if before is None else before.found)
         if before is not None and before.foreseen is not None:
             before.foreseen.passes.end()  # for what takes its place
         foreseen = _foresee(*one)

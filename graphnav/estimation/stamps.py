@@ -3,10 +3,11 @@
 A fix whose stamp is off by d is predicted from the state at the stamp, with an acceleration that is linear in time
 within `LINEAR_OFFSET` of it (`graphnav.constraints.gnss`). Farther away a vehicle's acceleration changes otherwise. So
 where an offset is estimated farther than that from where the rows are linearised, the stamps are moved to the estimate,
-that of the clocks' rate with it, and all is estimated anew, a step of Gauss-Newton, until the estimate stays within.
-Where the clocks of IMU and fixes disagree for certain (`graphnav.recording.checks.clock`), the first step is what they
-disagree by. The stamps as they are remain a candidate: the likelier stands. Stamps are moved before wrong measurements
-are searched for, as late fixes look wrong in every bend, and once more where the search has changed the noise model.
+that of the clocks' rate with it, and all is estimated again from there, a step of Gauss-Newton, until the estimate
+stays within. Where the clocks of IMU and fixes disagree for certain (`graphnav.recording.checks.clock`), the first step
+is what they disagree by. The stamps as they are remain a candidate: the likelier stands. Stamps are moved before wrong
+measurements are searched for, as late fixes look wrong in every bend, and once more where the search has changed the
+noise model.
 
 A solution is on the clock of the IMU, and what it says of fixes is on theirs (`shift_to_own_clocks`).
 """

@@ -17,6 +17,7 @@ from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import Alignment, align, motion, use_known_heading
+from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.recording import Recording
 
 DEG = np.pi / 180.0
@@ -167,6 +168,28 @@ def test_a_second_search_starts_where_the_first_ended(path: oracle.ExactPath, mo
     assert len(solved) - before - alone < alone
     assert np.abs(near.state.minus(anew.state)[0] / anew.sigma).max() < 0.01
     assert near.own_sigma == pytest.approx(anew.own_sigma, rel=0.01)
+
+
+@pytest.mark.parametrize("change", ["stamps", "span"])
+def test_a_second_search_over_another_span_tries_the_headings_of_the_first(path: oracle.ExactPath, change: str) -> None:
+    recording, _ = oracle.drive(path, seed=2)
+    first, frame = aligned(recording)
+    gnss = recording.gnss
+    moved = replace(gnss, t=gnss.t - 0.32) if change == "stamps" else pick_fixes(gnss, gnss.t > first.until)
+    nearly = replace(recording, gnss=moved)
+    anew, near = align(nearly, Settings(), frame), align(nearly, Settings(), frame, before=first)
+    assert near.motion == anew.motion
+    assert near.motion != first.motion
+    # each search ends where another step would move nothing by more than half as many sigmas
+    apart = 2.0 * np.sqrt(2.0 * Settings().solver.tolerance)
+    assert np.abs(ro.wrap(near.rph - anew.rph) / anew.own_sigma).max() < apart
+    assert ro.wrap(near.headings[0] - anew.headings[0]) == pytest.approx(0.0, abs=apart * anew.own_sigma[2])
+
+
+def test_what_is_no_minimum_is_not_tried_again(path: oracle.ExactPath) -> None:
+    recording, _ = oracle.drive(path, seed=2)
+    found, _ = aligned(recording, parse_settings({"solver": {"max_iterations": 1}}))
+    assert not found.headings
 
 
 def test_a_known_heading_is_taken(path: oracle.ExactPath) -> None:

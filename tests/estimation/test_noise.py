@@ -6,10 +6,12 @@ import functools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import oracle
 import pytest
+from scipy.optimize import brentq
 from scipy.special import chdtrc, chdtri
 
 from graphnav import load
@@ -27,7 +29,7 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.names import name_components
-from graphnav.estimation.noise import estimate
+from graphnav.estimation.noise import estimate, initial_points
 from graphnav.estimation.noise.apply import apply_noise, drop_parts, select_weights
 from graphnav.estimation.noise.components import begin_components
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
@@ -251,9 +253,10 @@ def test_an_estimate_from_elsewhere_ends_where_it_comes_to_a_known_one() -> None
     near = first.get_linearisation(base)
     alone, ended = (estimate_noise(base, opening, far, near, known=known) for known in (None, first))
     assert ended.passes["filter"] < alone.passes["filter"]
-    assert ended.log_evidence <= first.log_evidence
+    assert ended.noise is first.noise
+    assert ended.log_evidence == first.log_evidence
     for name, one in first.noise.figures.items():
-        assert abs(ended.noise.figures[name].log_factor - one.log_factor) <= one.sigma, name
+        assert abs(alone.noise.figures[name].log_factor - one.log_factor) <= one.sigma, name
     # not at one of other figures, nor of less evidence
     away = {name: replace(one, log_factor=one.log_factor + 9.0) for name, one in first.noise.figures.items()}
     for known in (
@@ -679,6 +682,27 @@ def test_starts_are_tried_until_two_lead_to_the_same(monkeypatch: pytest.MonkeyP
     assert found.log_evidence == pytest.approx(usual.log_evidence, abs=1e-6)
 
 
+def test_gross_outliers_that_hardly_lead_astray_are_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = lap()
+    gnss = recording.gnss
+    assert gnss is not None
+    bad = np.arange(len(gnss.t)) % 25 == 12
+    far = LocalFrame(gnss.llh[0])
+    wrong = replace(gnss, llh=far.to_llh(far.from_llh(gnss.llh) + np.outer(bad, [8.0, 0.0, 0.0])))
+    base, opening = built(replace(recording, gnss=wrong))
+    searched = []
+
+    def search(*given: Any, watch: bool = False, **more: Any) -> Any:
+        searched.extend([1] * watch)
+        return refilter(*given, watch=watch, **more)
+
+    monkeypatch.setattr(initial_points, "refilter", search)
+    (found,) = find_initial_points(base, opening)
+    assert len(searched) == 1
+    weights = found.weights["gnss_position"]
+    assert set(gnss.t[bad].round(3)) <= set(weights.t[weights.weight < 1.0].round(3))
+
+
 @pytest.mark.parametrize("wrong", [90.0, 135.0])
 def test_annealing_finds_a_heading_that_is_far_off(wrong: float) -> None:
     """While the heading is still wrong, half of the fixes look hundreds of metres off, and none is."""
@@ -891,4 +915,14 @@ def test_a_search_for_outliers_pays_only_where_there_are_some(disturbed: int, pa
     """An error of seven sigmas on each of three axes is worth more than ln(3000), the cost of one outlier."""
     squared = np.random.default_rng(1).chisquare(3, 2000)
     squared[:disturbed] = 3 * 7.0**2
+    assert may_pay(squared, np.full(2000, 3.0)) == pays
+
+
+@pytest.mark.parametrize(("more", "pays"), [(0.4, False), (0.6, True)])
+def test_an_outlier_that_gains_no_more_than_by_chance_does_not_pay(more: float, pays: bool) -> None:
+    """The first of 2000 costs ln(2999), and its own variance, at the squared error over 3, gains a half by chance."""
+    wanted = np.log(2999.0) + more
+    ratio = brentq(lambda x: 1.5 * (x - 1.0 - np.log(x)) - wanted, 1.0, 100.0)
+    squared = np.full(2000, 3.0)
+    squared[7] *= ratio
     assert may_pay(squared, np.full(2000, 3.0)) == pays

@@ -7,14 +7,17 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
-from helpers import random_states
+from helpers import random_states, truth_states
 from test_faults import OFF, scattered
 from test_solvers import sigmas
 
 from graphnav.config import Settings
+from graphnav.constraints.gnss import TIME_OFFSET
 from graphnav.core.earth import LocalFrame
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
+from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
@@ -24,21 +27,30 @@ from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, advance, linearise, scale_at
+from graphnav.estimation.solvers.passes import carry_points, split_values
 from graphnav.estimation.solvers.points import Linearisation, PointFilter
 from graphnav.estimation.solvers.recursion import move_columns
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Stack
+from graphnav.recording import Recording
+
+Drive = tuple[Recording, Trajectory]
 
 
 @pytest.fixture(scope="module")
-def built() -> Problem:
-    """Every constraint of a vehicle, fixes with velocities and errors that last."""
-    recording, _ = oracle.drive(
+def drive() -> Drive:
+    return oracle.drive(
         oracle.vehicle_path(duration=200, rate=50.0, seed=7),
         seed=5,
         gnss_velocity_sd=(0.1, 0.1, 0.1),
         odometer_rate=20.0,
     )
+
+
+@pytest.fixture(scope="module")
+def built(drive: Drive) -> Problem:
+    """Every constraint of a vehicle, fixes with velocities and errors that last."""
+    recording, _ = drive
     settings = Settings()
     frame = LocalFrame(choose_origin(recording))
     found = align(recording, settings, frame)
@@ -58,6 +70,24 @@ def derivative(f: object, width: int, eps: float = 1e-5) -> Array:
     """Central differences."""
     steps = eps * np.eye(width)
     return np.stack([(f(e) - f(-e)) / (2.0 * eps) for e in steps], axis=-1)
+
+
+def test_points_carried_to_other_keyframes_are_as_near_to_the_truth(drive: Drive, built: Problem) -> None:
+    smoothed = smooth_backward(built, ekf(built))
+    later = replace(built, t=built.t + 0.3)
+    carried = carry_points(smoothed, built, later, anew=(TIME_OFFSET,))
+    error = carried.states[:-1].minus(truth_states(drive[1], later.t[:-1], built.frame))[:, :9]
+    # half a second of the IMU adds nothing to sigmas that hold at either side
+    sigma = np.sqrt(smoothed.variance[:-1, :9])
+    assert np.abs(error / sigma).max() < 5.0
+    last, end = carried.states[-1:], smoothed.states[-1:]
+    np.testing.assert_allclose(last.p, end.p + 0.3 * end.v)
+    np.testing.assert_allclose(last.R_nb, end.R_nb, atol=1e-12)
+    for chain in built.chains:
+        name = chain.parameter.name
+        value = split_values(later, carried)[name]
+        known = split_values(built, smoothed)[name][pick_nearest(built.t, later.t)]
+        np.testing.assert_array_equal(value, chain.mean[chain.node] if name == TIME_OFFSET else known)
 
 
 def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(built: Problem) -> None:

@@ -62,8 +62,8 @@ def align(
     span = find_motion_span(recording, settings, stationary)
     if span is None:
         return level_at_rest(recording, settings, frame, stationary)
-    minima = () if before is None else before.minima
-    return replace(align_in_motion(recording, settings, frame, span, stationary, minima), motion=span[0], until=span[1])
+    found = align_in_motion(recording, settings, frame, span, stationary, before)
+    return replace(found, motion=span[0], until=span[1])
 
 
 def is_ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:

@@ -27,7 +27,7 @@ class Alignment:
     notes: tuple[str, ...]
     motion: float | None = None  # s, from when on the heading is known: the first motion, or two antennas; None: never
     until: float | None = None  # s, end of the span that a filter processes twice: the span of motion, or first steps
-    minima: tuple[States, ...] = ()  # of the problem over the span of motion, from all headings tried
+    headings: tuple[float, ...] = ()  # rad, at `motion`, of all minima of the problem over the span of motion
 
     @property
     def rph(self) -> Array:

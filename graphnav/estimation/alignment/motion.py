@@ -127,12 +127,12 @@ def align_in_motion(
     frame: LocalFrame,
     span: tuple[float, float],
     stationary: Array = NONE,
-    minima: Sequence[States] = (),
+    before: Alignment | None = None,
 ) -> Alignment:
     """The first state from the short problem over `span` (s), carried back to the first sample.
 
-    The platform stands in the intervals `stationary` (N, 2) s. `minima` are those of nearly the same problem, tried in
-    place of initial headings if there are as many keyframes.
+    The platform stands in the intervals `stationary` (N, 2) s. `before` is the alignment of nearly the same recording:
+    the headings that it found are tried, and no others.
     """
     gnss, imu = recording.gnss, recording.imu
     assert gnss is not None
@@ -144,12 +144,14 @@ def align_in_motion(
     bias = _estimate_rate(imu)
     rp = level(recording, begin)
     heading = _fit_heading(part, frame, rp, bias)
+    headings = [heading + turn for turn in _HEADINGS_TRIED]
+    if before is not None and before.motion is not None and before.headings:
+        turned = integrate_yaw(imu, np.sort([before.motion, begin]), bias)[1]
+        headings = [known - turned if begin > before.motion else known + turned for known in before.headings]
     problem, widened = _build_short(part, settings, frame, np.array([*rp, heading]), bias), STATED
     for _ in range(_MAX_ROUNDS):
         used = apply_noise(problem, widened)
-        alike = len(minima) > 0 and len(minima[0]) == len(used.t)
-        starts = minima if alike else [_guess_start(used, rp, heading + turn) for turn in _HEADINGS_TRIED]
-        tried = _try(used, rp, starts)
+        tried = _try(used, rp, [_guess_start(used, rp, one) for one in headings])
         if not tried:
             raise EstimationError(
                 f"'{recording.name}': no initial attitude explains the GNSS fixes between "
@@ -180,8 +182,10 @@ def align_in_motion(
         ),
         *notes,
     )
-    found = tuple({id(one): one.states for one in tried}.values())
-    return replace(carry_back(recording, settings, best, R, wide, own, begin, stationary, notes), minima=found)
+    found = carry_back(recording, settings, best, R, wide, own, begin, stationary, notes)
+    # what was still moving at the limit of iterations is no minimum
+    minima = {id(one): one for one in tried if one.iterations < settings.solver.max_iterations}.values()
+    return replace(found, headings=tuple(float(rotation.to_rph(one.states.R_nb[0])[2]) for one in minima))
 
 
 def _fit_heading(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:

@@ -112,7 +112,7 @@ def estimate_noise(
     near : first linearisation points, of all keyframes, and the problem that they are of.
     intervals : whether single intervals of the IMU may have more noise than the others.
     scales : whether the IMU's scale errors may be larger or smaller than stated.
-    known : an estimate by the same figures of the same measurements; where this one comes to it, it ends.
+    known : an estimate by the same figures of the same measurements; where this one comes to it, that is returned.
 
     Raises
     ------
@@ -199,8 +199,9 @@ def _iterate(
             most_expected = max(most_expected, expected)
             if progress is not None:
                 progress("noise", 1.0 - np.log1p(expected) / np.log1p(most_expected))
+            if known is not None and end == total and known.attracts(figures.log, ahead, evidence):
+                return replace(known, passes=_count(done, total))
             converged = near and abs(gained) < _SETTLED * _CHANCE_GAIN * len(figures.log)
-            converged |= known is not None and end == total and known.attracts(here.log, ahead, evidence)
             if converged or since == _UNSETTLED:
                 break
         figures = here if converged and end == total else figures if converged else likeliest
@@ -213,8 +214,12 @@ def _iterate(
         information = _collect(figures, used, *latest)[1]
     assert latest is not None
     figures.sigmas = figures.compute_sigmas(information)
-    passes = Counter(filter=round(done / total), smoother=round(done / total))
-    return NoiseEstimate(figures.build_model(), latest[1], prior_then, evidence, passes)
+    return NoiseEstimate(figures.build_model(), latest[1], prior_then, evidence, _count(done, total))
+
+
+def _count(done: int, total: int) -> Counter[str]:
+    """Passes, of so many keyframes in all and in each."""
+    return Counter(filter=round(done / total), smoother=round(done / total))
 
 
 def _average(problem: Problem, figures: Components, before: Components) -> None:

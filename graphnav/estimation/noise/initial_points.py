@@ -27,7 +27,7 @@ BREAKDOWN = EstimationError, np.linalg.LinAlgError  # errors of a filter with a 
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
 _STEPS = 20  # of Gauss and Newton in a round at most; residuals of a heading that is still wrong tell nothing
 _SETTLED = 1e-2  # sigmas by which linearisation points may be off without effect
-_SEARCHES = 5  # searches for gross outliers at most; in most drives the second finds the same ones
+_SEARCHES = 5  # searches for gross outliers at most
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,10 @@ def find_initial_points(problem: Problem, opening: float | None) -> Iterator[Ini
     """Find points of a filter that uses all measurements, and others if leaving gross outliers out leads elsewhere.
 
     Gross outliers lead a filter that uses all measurements too far from the truth for linearisation. So they are left
-    out, and searched again with the filter without them, until the same ones are found. Growing errors are not searched
-    for: while the heading is still uncertain, the filter itself drifts against the fixes. If that leads elsewhere, or
-    the filter breaks down, points that rest on few outliers are found by annealing, once they are asked for.
+    out, and searched again with the filter without them, until that is near the one before. Growing errors are not
+    searched for: while the heading is still uncertain, the filter itself drifts against the fixes. If that leads
+    elsewhere, or the filter breaks down, points that rest on few outliers are found by annealing, once they are asked
+    for.
 
     Parameters
     ----------
@@ -80,13 +81,16 @@ def _leave_out_gross(problem: Problem, opening: float | None, plain: Points) -> 
     and whether nothing else has to be tried.
     """
     sound, about, passes = problem, plain, 1
+    seen, near = [_list_unused(problem)], False
     smoothed: SmootherPass | None = None
     try:
-        for _ in range(_SEARCHES):
+        while not near and len(seen) <= _SEARCHES:  # about near points, a search finds the same
             found = weigh_rows(problem, refilter(problem, about, watch=True, drifts=False, whole=False).weights)
-            if _list_unused(found) == _list_unused(sound):
+            if (unused := _list_unused(found)) in seen:
                 break
+            seen.append(unused)
             sound, smoothed = found, smooth_near(found, about, opening)
+            near = are_near(smoothed, about)
             about, passes = smoothed, passes + 2
         if smoothed is None:
             return [Initial(plain, passes)], True

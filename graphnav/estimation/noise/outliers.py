@@ -65,15 +65,15 @@ def _compute_cost(k: Array, total: int) -> Array:
 
 
 def may_pay(squared: Array, freedom: Array) -> bool:
-    """Whether any number of disturbed intervals may gain more log-likelihood than it costs.
+    """Whether any number of disturbed intervals may gain more log-likelihood than it costs, and than by chance.
 
     Parameters
     ----------
     squared : (N,) errors, as stated chi-square variables of m = `freedom` (N,); with the variance that fits it best,
-        each that exceeds m gains (squared - m - m ln(squared / m)) / 2.
+        each that exceeds m gains (squared - m - m ln(squared / m)) / 2, of which a half is by chance, in the mean.
     """
     ratio = np.maximum(squared / freedom, 1.0)
-    gain = np.sort(0.5 * freedom * (ratio - 1.0 - np.log(ratio)))[::-1]
+    gain = np.sort(0.5 * freedom * (ratio - 1.0 - np.log(ratio)) - 0.5)[::-1]
     return bool((np.cumsum(gain) > _compute_cost(np.arange(1, len(gain) + 1), len(gain))).any())
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
 
 from graphnav.constraints.base import Constraint
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import make_dense
@@ -202,6 +203,20 @@ def spread_nodes(problem: Problem, nodes: Mapping[str, Array]) -> dict[str, Arra
 def reuse_points(points: Points, before: Problem, after: Problem) -> Points:
     """Points for another problem with the same keyframes."""
     return make_points(after, points.states, split_values(before, points))
+
+
+def carry_points(points: Points, before: Problem, after: Problem, anew: Collection[str] = ()) -> Points:
+    """Points for a problem of the same drive with other keyframes; beyond the first and the last, velocities stay.
+
+    `anew` are the parameters that begin with their expected values.
+    """
+    none = np.zeros((len(before.t), DIM, DIM))  # covariances, which are not wanted between keyframes either
+    between = make_dense(before, points.states, none, scale_at(before.columns, points.values), smooth=True)
+    t = np.clip(after.t, before.t[0], before.t[-1])
+    states, nearest = between(t)[0], pick_nearest(before.t, after.t)
+    states = replace(states, p=states.p + (after.t - t)[:, None] * states.v)
+    known = {name: x[nearest] for name, x in split_values(before, points).items() if name not in anew}
+    return make_points(after, states, known)
 
 
 def record_residuals(problem: Problem, rows: Constraint, points: Points, robust: bool = False) -> ConstraintRecord:
