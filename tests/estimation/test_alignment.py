@@ -84,6 +84,21 @@ def test_a_steady_drive_before_its_first_fix_is_no_stand(path: oracle.ExactPath)
     assert_good(*judged(part.without("gnss", (0.0, 15.0)), truth))
 
 
+@pytest.mark.parametrize("begin", [52.0, 75.0, 95.0])
+def test_wheels_that_read_no_sign_turn_forwards_before_the_first_fix(path: oracle.ExactPath, begin: float) -> None:
+    recording, truth = oracle.drive(path, seed=2, odometer_rate=10.0, gnss_sd=oracle.SPP_SD)
+    odometer = recording.odometer
+    assert odometer is not None
+    unsigned = replace(recording, odometer=replace(odometer, signed=False)).crop(begin)
+    assert unsigned.odometer.speed[0] > 3.0
+    dark = unsigned.without("gnss", (0.0, 40.0))
+    found, _ = aligned(dark)
+    error, own, over = judged(dark, truth)
+    assert np.all(np.abs(error) < 4.0 * own)
+    assert np.all(np.abs(over) < 4.0)
+    assert found.state.v[0] @ found.state.R_nb[0][:, 1] == pytest.approx(dark.odometer.speed[0], rel=0.1)
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("stated", [1.0, 0.01])
 def test_sigmas_of_fixes_that_are_too_small(path: oracle.ExactPath, seed: int, stated: float) -> None:

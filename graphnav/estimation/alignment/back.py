@@ -18,6 +18,7 @@ from graphnav.recording import Recording
 
 _FIRST_SPAN = 5.0  # s between the fixes that give the first velocity
 _CHANGE = 2.0  # m/s^2, bound on the change of speed where it is not measured
+_CERTAIN = -np.log(0.01)  # log-likelihood ratio that outweighs that one drive in a hundred begins in reverse
 
 
 def carry_back(
@@ -150,6 +151,8 @@ def _refine_by_wheels(
     sd_v_wheels = np.full(3, STANDING + abs(speed[0]) * off)
     if np.linalg.norm(sd_v_wheels) < np.linalg.norm(sd_v):
         v, sd_v = speed[0] * R[:, 1], sd_v_wheels
+    elif not odometer.signed and 2.0 * abs(speed[0] * (R[:, 1] @ v)) < _CERTAIN * (R[:, 1] ** 2 @ sd_v**2):
+        v = speed[0] * R[:, 1]  # where v may be of either sign, the filter would take the reading for that of its mean
     step = np.diff(np.append(t, begin))
     sd_p_wheels = there[1] + float(np.sum(step * np.abs(speed))) * off
     if np.linalg.norm(sd_p_wheels) < np.linalg.norm(sd_p):
