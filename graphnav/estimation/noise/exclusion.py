@@ -38,7 +38,8 @@ are suspected instead, the same way, and the likeliest stands, of both and of th
 that leaves other spans out, so are the fixes before these. An estimate without the fixes before that explains the rest
 no better than what stands has lost: those fixes agree with the latter, and would have to be explained as wrong.
 Figures bent by a fault find other segments wrong than those estimated without it: the segments that are wrong by the
-figures of what stands are suspected last.
+figures of what stands are suspected last. Which part of a drive is right is decided at the end
+(`graphnav.estimation.noise.rivals`).
 """
 
 from __future__ import annotations

@@ -5,6 +5,10 @@ Where fixes step from one place to another, either part of them may be wrong, an
 and the disturbed intervals of the accelerometer divide the drive into segments, and all sets of these are compared by
 the same figures, with what stands. The likeliest is left out. Sets that are not much less likely are its rivals:
 evidence of less than 20 to 1 is not strong (Kass and Raftery 1995, "Bayes factors").
+
+Sets have errors in common, and what stands may be likelier by outliers or by errors of each fix. Outliers tell nothing
+of which part is right, so its complement is compared by errors in common of both. Where each fix of a span has an error
+of its own, that is what is wrong with it, and no error of all others takes its place.
 """
 
 from __future__ import annotations
@@ -21,10 +25,11 @@ from scipy.special import chdtri
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.estimation.faults.segments import compare_wrong_segments
+from graphnav.estimation.faults.watch import FAULT_COST
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.decision import add_outliers, log_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.explanations import FIXES
+from graphnav.estimation.noise.explanations import FIXES, add_own_errors, measure_sizes
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, Rival
 from graphnav.estimation.noise.moments import predict_errors
@@ -52,15 +57,17 @@ class _Weighed:
 
     standing: bytes
     sets: dict[bytes, tuple[float, _Spans, bool]]
+    passes: int  # of the filter
 
     def find_likeliest(self) -> bytes:
         """Of the sets whose errors are large, and what stands."""
         return max(self.sets, key=lambda one: self.sets[one][0] if self.sets[one][2] else -np.inf)
 
-    def is_complement(self, one: bytes) -> bool:
-        """Whether a set has, of each kind of fixes that is wrong in part, those that are right by what stands."""
-        a, b = (np.frombuffer(some, dtype=bool).reshape(len(FIXES), -1) for some in (one, self.standing))
-        return bool(np.all((a ^ b) | ~np.any(a | b, axis=1, keepdims=True)))
+
+def is_complement(one: bytes, other: bytes) -> bool:
+    """Whether a set has, of each kind of fixes of which some are in another, those that are not in that."""
+    a, b = (np.frombuffer(some, dtype=bool).reshape(len(FIXES), -1) for some in (one, other))
+    return bool(np.all((a ^ b) | ~np.any(a | b, axis=1, keepdims=True)))
 
 
 def choose_likeliest(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
@@ -74,8 +81,8 @@ def choose_likeliest(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     edges = _list_edges(base, found)
     if not edges:
         return found
-    weighed, passes = _weigh(base, found, edges), found.passes + Counter(filter=1)
-    likeliest = weighed.find_likeliest()
+    weighed = _weigh(base, found, edges)
+    passes, likeliest = found.passes + Counter(filter=weighed.passes), weighed.find_likeliest()
     if likeliest != weighed.standing:
         before, spans, _ = weighed.sets[likeliest]
         start = exclude(found.noise, spans, list_fix_times(base))
@@ -85,8 +92,8 @@ def choose_likeliest(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
             # those found are of more measurements, unless these contradicted each other
             known = replace(found, noise=start, points=_smooth(apply_noise(base, start), near), whole_evidence=before)
             other = estimate_noise(base, None, start, known.get_linearisation(base), intervals=intervals)
-            passes = passes + other.passes + Counter(filter=2, smoother=1)
             again = _weigh(base, other, edges)
+            passes = passes + other.passes + Counter(filter=1 + again.passes, smoother=1)
             evidence = again.sets[likeliest][0] if again.find_likeliest() == likeliest else -np.inf
             found = replace(other, whole_evidence=evidence) if evidence > before else known
     return replace(found, passes=passes)
@@ -106,7 +113,7 @@ def find_rivals(base: Problem, found: NoiseEstimate) -> tuple[tuple[Rival, ...],
     some = {
         key: one
         for key, one in weighed.sets.items()
-        if one[2] or weighed.is_complement(key)  # of which the errors are the same
+        if one[2] or is_complement(key, weighed.standing)  # of which the errors are the same
     }
     most = max(evidence for evidence, _, _ in some.values())
     odds = {key: float(np.exp(evidence - most)) for key, (evidence, _, _) in some.items()}
@@ -116,7 +123,7 @@ def find_rivals(base: Problem, found: NoiseEstimate) -> tuple[tuple[Rival, ...],
         for key, (_, spans, _) in some.items()
         if key != weighed.standing and odds[key] * _STRONG > odds[weighed.standing]
     ]
-    return tuple(sorted(rivals, key=lambda one: -one.probability)), 1
+    return tuple(sorted(rivals, key=lambda one: -one.probability)), weighed.passes
 
 
 def exclude(noise: NoiseModel, spans: _Spans, t: Array) -> NoiseModel:
@@ -171,11 +178,30 @@ def _weigh(base: Problem, found: NoiseEstimate, edges: list[float]) -> _Weighed:
         evidence, _, large = weighed.get(key, (-np.inf, {}, key == standing))
         spans = {name: tuple(join_adjacent(list(each), t)) for name, each in one.spans.items()}
         weighed[key] = float(np.logaddexp(evidence, least + one.log_odds)), spans, large or one.large
-    left_out = {name: each for name, each in found.noise.excluded.items() if name in FIXES and each}
-    if standing not in weighed or not left_out:  # with its disturbed intervals
-        evidence = max(log_evidence(base, found), weighed.get(standing, (-np.inf,))[0])
-        weighed[standing] = evidence, left_out, True
-    return _Weighed(standing, weighed)
+    spans = {name: each for name, each in found.noise.excluded.items() if name in FIXES and each}
+    if not spans:
+        weighed[standing] = found.log_evidence, spans, True  # with its disturbed intervals
+        return _Weighed(standing, weighed, 1)
+    alike = weighed[standing][0] if standing in weighed else -np.inf  # with an error in common in each span
+    alike = max(alike, least + _weigh_own_errors(base, used, found, spans) - likelihood)
+    # where wheels are left out as well, the evidence of all measurements is of more than that of the sets
+    most = alike if any(noise.excluded.values()) else max(alike, log_evidence(base, found))
+    for key, (evidence, each, large) in weighed.items():
+        if is_complement(key, standing):  # whatever is more for what stands is of how its errors are modelled
+            weighed[key] = evidence + most - alike, each, large
+    weighed[standing] = most, spans, True
+    return _Weighed(standing, weighed, 2)
+
+
+def _weigh_own_errors(base: Problem, used: Problem, found: NoiseEstimate, spans: _Spans) -> float:
+    """The log-likelihood of all measurements, less its costs, if each fix in the spans of an estimate has an error of
+    its own: then the others cannot be wrong instead, by an error in common."""
+    cost = 0.0
+    for name, some in spans.items():
+        sizes = measure_sizes(base, apply_noise(base, found.noise), found.points, list(some))
+        used = add_own_errors(used, list(some), (name,), sizes)
+        cost += float(np.sum(sizes.cost[name])) + FAULT_COST * len(some)
+    return float(np.sum(refilter(used, found.carry_points(base, used), whole=False).log_likelihood)) - cost
 
 
 def _mark(t: Array, spans: _Spans) -> bytes:
