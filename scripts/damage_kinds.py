@@ -93,6 +93,14 @@ def late_stamps(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
     return replace(gnss, t=t + np.arange(len(t)) * 1e-7), f"stamps late by {late:.2f} s and up to {jitter} more"
 
 
+def step(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
+    """All fixes from one on are off alike, as where the base station changes."""
+    begin = gnss.t[0] + rng.uniform(0.1, 0.9) * (gnss.t[-1] - gnss.t[0])
+    size, error = float(np.exp(rng.uniform(np.log(0.5), np.log(20.0)))), rng.standard_normal(3)
+    by = np.outer(gnss.t >= begin, size * error / np.linalg.norm(error))
+    return moved(gnss, by), f"{size:.1f} m off from {begin - gnss.t[0]:.0f} s on"
+
+
 def wrong_arm(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
     by = rng.uniform(-0.8, 0.8, 3)
     return replace(gnss, lever_arm=gnss.lever_arm + by), f"lever arm off by {np.linalg.norm(by):.1f} m"
@@ -266,4 +274,4 @@ HABITS = (
     Fault("odometer", 0.5, ticks),
     Fault("gnss", 0.3, drifting_clock),
 )
-FAMILIES = {"faults": FAULTS, "habits": HABITS}
+FAMILIES = {"faults": FAULTS, "habits": HABITS, "steps": (Fault("gnss", 1.0, step),)}

@@ -36,6 +36,7 @@ from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.rivals import find_rivals
 from graphnav.estimation.noise.span_variances import weigh_excluded
 from graphnav.estimation.noise.tails import widen_by_tails
 from graphnav.estimation.problem import Problem
@@ -141,6 +142,9 @@ def find_noise(
     likelier = _is_likelier(built.problem, plain, best)
     noise = plain if likelier else widen_by_tails(built.problem, joint.noise)
     near = best.get_linearisation(built.problem)
+    rivals, spent = find_rivals(built.problem, best)
+    passes.update(filter=spent)
+    noise = replace(noise, rivals=rivals)
     if noise.excluded:
         with contextlib.suppress(*BREAKDOWN):
             noise, spent = weigh_excluded(built.problem, noise, near)

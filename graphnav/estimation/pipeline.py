@@ -22,6 +22,7 @@ from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.memory import return_memory
 from graphnav.core.notes import Note, Notes
 from graphnav.core.progress import Progress, send_progress, tell
+from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
@@ -340,12 +341,13 @@ def _solve(
         )
         for name in solvers
     }
-    return {name: shift_to_own_clocks(_curve(one), stamps) for name, one in by_name.items()}
+    return {name: shift_to_own_clocks(_widen(one, found.spread), stamps) for name, one in by_name.items()}
 
 
-def _curve(solution: Solution) -> Solution:
-    """The solution with what an unknown heading makes of its positions to second order."""
+def _widen(solution: Solution, spread: Array | None) -> Solution:
+    """The solution with what an unknown heading makes of its positions to second order, and what may be wrong."""
     P = add_curvature(solution.covariance, solution.states)
+    P = P if spread is None else P + spread
     between = (replace(one, covariance=P) if isinstance(one, Dense) else one for one in solution.between)
     return replace(solution, covariance=P, between=tuple(between))
 

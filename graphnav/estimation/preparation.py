@@ -62,6 +62,7 @@ from graphnav.estimation.solvers.passes import (
     reuse_points,
 )
 from graphnav.estimation.solvers.rts import smooth_backward
+from graphnav.estimation.spread import compare_rivals
 from graphnav.recording import Recording
 
 _Passes = tuple[FilterPass, SmootherPass, dict[str, float]]  # and the seconds that they took, by stage
@@ -86,6 +87,7 @@ class Prepared:
     log_evidence: float = np.inf  # of all measurements by the estimated noise model, where that is wanted
     ahead: Points | None = None  # a step of Gauss and Newton behind `smoothed`, where it is known
     unmeasured: UnmeasuredRows = field(default_factory=UnmeasuredRows)  # no part of the problem
+    spread: Array | None = None  # (K, 15, 15) of covariances, by what may be wrong instead
 
     @property
     def diverged(self) -> bool:
@@ -294,7 +296,10 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
                 noise = replace(noise, searched=False)
         forward, smoothed, ahead = found
     passes.update(filter=1, smoother=1)
+    spread, doubts = compare_rivals(built.problem, noise, problem, smoothed)
+    passes.update(filter=len(noise.rivals), smoother=len(noise.rivals))
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))
+    notes = (*doubts, *notes)
     epochs, arcs = dict[str, Array](), {"": CarrierArcs()}
     rest, carriers = (problem, built.carriers) if built.carriers is not None else split_carriers(problem)
     if carriers is not None:
@@ -307,7 +312,7 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
     start = use_known_heading(aligned, settings)
     return Prepared(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
-        evidence, ahead, begun.unmeasured,
+        evidence, ahead, begun.unmeasured, spread,
     )  # fmt: skip
 
 

@@ -374,6 +374,11 @@ def _join_noise(parts: list[NoiseModel]) -> NoiseModel:
         weights=weights,
         excluded=_join_spans([part.excluded for part in parts]),
         span_weights=_join_spans([part.span_weights for part in parts]),
+        rivals=tuple(
+            replace(one, excluded=_join_spans([one.excluded if p is part else p.excluded for p in parts]))
+            for part in parts
+            for one in part.rivals
+        ),
         false_stops=tuple(span for part in parts for span in part.false_stops),
     )
 

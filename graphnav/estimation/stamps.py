@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -297,12 +297,14 @@ def _shift_noise(noise: NoiseModel, change: Callable[[Any, float, float, float],
     def move(t: Array | float, name: str) -> Any:
         return change(t, by[name], stamps.rate, stamps.since) if name in by else t
 
+    def move_spans(some: Mapping[str, tuple[Span, ...]]) -> dict[str, tuple[Span, ...]]:
+        return {name: tuple((move(a, name), move(b, name)) for a, b in spans) for name, spans in some.items()}
+
     return replace(
         noise,
         weights={name: RowWeights(move(one.t, name), one.weight) for name, one in noise.weights.items()},
-        excluded={
-            name: tuple((move(a, name), move(b, name)) for a, b in spans) for name, spans in noise.excluded.items()
-        },
+        excluded=move_spans(noise.excluded),
+        rivals=tuple(replace(one, excluded=move_spans(one.excluded)) for one in noise.rivals),
         span_weights={
             name: tuple((move(a, name), move(b, name), weight) for a, b, weight in spans)
             for name, spans in noise.span_weights.items()

@@ -24,7 +24,7 @@ from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.noise.files import list_groups, list_noise, read_noise, read_noise_and_mode, write_noise
-from graphnav.estimation.noise.model import STATED, FreedConstant, NoiseModel, RowWeights, VarianceComponent
+from graphnav.estimation.noise.model import STATED, FreedConstant, NoiseModel, Rival, RowWeights, VarianceComponent
 from graphnav.estimation.noise.table import compute_whole_ratio, tabulate_figures
 from graphnav.estimation.problem import build_problem
 from graphnav.recording.formats import read as load
@@ -42,6 +42,7 @@ def some_noise(seed: int = 0) -> NoiseModel:
         {"gnss_error_of_seconds": float(rng.uniform(0.2, 60.0)), "nhc_error": 1.0 / 3.0},
         {"gnss_position": RowWeights(t, rng.uniform(0.0, 1.0, 50))},
         {"gnss_position": ((t[3], t[7]), (t[9], t[9])), "nhc": ((t[1], t[2]),)},
+        rivals=(Rival(float(rng.uniform()), {"gnss_position": ((t[8], t[9]),)}),),
         freed={
             LEVER_ARM: FreedConstant(tuple(rng.normal(size=3).tolist()), tuple(rng.uniform(0.001, 0.1, 3).tolist())),
             CLOCK_RATE: FreedConstant((float(rng.normal(0.0, 1e-4)),), (float(rng.uniform(1e-6, 1e-5)),)),
@@ -55,7 +56,7 @@ def test_a_noise_model_comes_back_to_the_last_digit(tmp_path: Path) -> None:
     again, mode = read_noise_and_mode(write_noise(tmp_path / "noise.json", noise, "stated"))
     assert mode == "stated"
     assert (again.figures, again.times, again.excluded) == (noise.figures, noise.times, noise.excluded)
-    assert again.freed == noise.freed
+    assert (again.freed, again.rivals) == (noise.freed, noise.rivals)
     assert again.weights.keys() == noise.weights.keys()
     for name, some in noise.weights.items():
         np.testing.assert_array_equal(again.weights[name].t, some.t)
@@ -159,6 +160,14 @@ BAD = {
         ("odometer_delay.value'", "3600.0"),
     ),
     "half a span": (changed("noise/excluded/nhc", [[1.0]]), "key.value", ("excluded.nhc'", "[1.0]")),
+    "a rival alone": (changed("noise/rivals", {"probability": 0.5}), "key.value", ("noise.rivals'",)),
+    "rivals by chance": (changed("noise/rivals", [{"excluded": {}}]), "key.value", ("rivals.probability'", "null")),
+    "more than certain": (changed("noise/rivals", [{"probability": 1.5}]), "key.value", ("probability'", "= 1.5")),
+    "half a rival's span": (
+        changed("noise/rivals", [{"probability": 0.5, "excluded": {"nhc": [[1.0]]}}]),
+        "key.value",
+        ("excluded.nhc'", "[1.0]"),
+    ),
     "backward span": (changed("noise/excluded/nhc", [[2.0, 1.0]]), "key.value", ("excluded.nhc'", "[2.0, 1.0]")),
 }
 

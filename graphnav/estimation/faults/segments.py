@@ -15,11 +15,19 @@ over the whole drive, and W the prior sizes of errors, the evidence of a set A o
 columns of G are then summed. Sets are found by forward selection, the likeliest few of each size; each choice leaves
 the others what is left of s and I when its errors are known as well as they are. An error that is not large
 (`watch.LARGE`) is no fault, however certain.
+
+Which part is right. That all fixes of one part are off by an error that stays is as likely, whatever is measured, as
+that all others are off by its opposite: nothing but fixes tells where a vehicle is. Then the prior alone decides. Let
+faults last longer than L with the probability S(L). One that is in progress at the start and goes on for L is as
+probable beforehand as one that begins later and has not ended after L: both are proportional to S(L) (a renewal process
+in its steady state; Cox 1962, "Renewal theory"). Faults end at rates that differ, as those of reflections and those of
+a base station; with a Gamma distribution of the rate, S(L) = (1 + L / s)^-a. Here a = 2, the least whole number by
+which their mean duration s / (a - 1) is finite, and that is a minute (`watch.MINUTE`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,18 +62,20 @@ class _Set:
 class _Runs:
     """All runs of consecutive segments, each with one error in common; C numbers of all kinds.
 
-    The last segment is of no run: an error of which the end is not seen may as well be a step to what is right.
-
     Parameters
     ----------
     begins : (M,) s, of the segments.
     units : of each kind of fixes.
     m : numbers of a fix.
     score, info : (M, C) and (M, C, M, C) of the errors of all segments.
+    end : s, of the last segment, where it may be wrong too, an error may stay without growing, and long faults are less
+        probable. Else it is of no run: an error of which the end is not seen may as well be a step to what is right.
     """
 
-    def __init__(self, begins: Array, units: list[str], m: int, score: Array, info: Array) -> None:
-        first, last = np.triu_indices(len(begins) - 1)
+    def __init__(
+        self, begins: Array, units: list[str], m: int, score: Array, info: Array, end: float | None = None
+    ) -> None:
+        first, last = np.triu_indices(len(begins) - (end is None))
         self.first, self.behind, C = first, last + 1, 2 * m * len(units)
         # an error b that stays and one g that grows by the minute since a run began, by those since the first segment
         minutes = (begins[first] - begins[0]) / MINUTE
@@ -77,6 +87,10 @@ class _Runs:
                 self.shift[:, i, i + m] = -minutes * size[i + m]
         each = [np.arange(2 * m * i, 2 * m * (i + 1)) for i in range(len(units))]
         self.kinds = [np.arange(C), *each] if len(units) > 1 else each
+        self.cost, self.to_end = np.full(len(first), FAULT_COST), end is not None
+        if end is not None:
+            self.kinds += [own[own % (2 * m) < m] for own in self.kinds]
+            self.cost += 2.0 * np.log1p((np.append(begins, end)[self.behind] - begins[first]) / MINUTE)
         # sums over the segments before each: a run has the difference of two
         self.score = _sum_before(score)
         self.info = np.ascontiguousarray(np.swapaxes(_sum_before(np.swapaxes(_sum_before(info), 0, 2)), 0, 2))
@@ -92,7 +106,7 @@ class _Runs:
         """The likeliest of those that share no segment with a set and increase its odds: increase, run, kind."""
         out = []
         for number, kind in enumerate(self.kinds):
-            gain = compute_gains(one.score[:, kind], one.info[:, kind[:, None], kind]) - FAULT_COST
+            gain = compute_gains(one.score[:, kind], one.info[:, kind[:, None], kind]) - self.cost[one.runs]
             out += [(float(gain[i]), int(one.runs[i]), number) for i in np.argsort(-gain)[:_BEAM] if gain[i] > 0.0]
         return sorted(out, reverse=True)[:_BEAM]
 
@@ -130,6 +144,15 @@ class _Runs:
         return out
 
 
+@dataclass(frozen=True)
+class WrongSegments:
+    """Segments of fixes that may be wrong together."""
+
+    log_odds: float  # beside nothing being wrong
+    spans: Mapping[str, tuple[tuple[float, float], ...]]  # by constraint: first and last fix of each run, s
+    large: bool  # whether the error of each is
+
+
 def find_wrong_segments(
     problem: Problem, about: Points, edges: Sequence[float], names: Collection[str]
 ) -> list[tuple[float, float]]:
@@ -146,8 +169,39 @@ def find_wrong_segments(
     begins, m = np.array(edges), len(fixes[0].axes)
     responses = _respond(problem, refilter(problem, about, whole=False), fixes, begins)
     runs = _Runs(begins, [rows.unit for rows in fixes], m, *responses)
-    best = runs.begin()
-    beam = [best]
+    best = max(_list_likeliest(runs), key=lambda one: one.log_odds)
+    return [
+        (first, last) for _, first, last, large in _describe_runs(problem, about, fixes, begins, runs, best) if large
+    ]
+
+
+def compare_wrong_segments(
+    problem: Problem, about: Points, edges: Sequence[float], names: Collection[str]
+) -> tuple[float, list[WrongSegments]]:
+    """The log-likelihood of all measurements if no fix is wrong, and the likeliest sets of wrong segments, each of one,
+    two and more runs: those that last to the end as well, and with errors that stay or grow.
+
+    Parameters
+    ----------
+    problem, about, edges, names : as for `find_wrong_segments`; the first edge at the first fix.
+    """
+    fixes = [rows for rows in problem.constraints if rows.name in names]
+    begins, m, forward = np.array(edges), len(fixes[0].axes), refilter(problem, about, whole=False)
+    responses = _respond(problem, forward, fixes, begins)
+    runs = _Runs(begins, [rows.unit for rows in fixes], m, *responses, float(problem.t[-1]))
+    out = []
+    for one in _list_likeliest(runs):
+        spans, each = dict[str, tuple[tuple[float, float], ...]](), True
+        for wrong, first, last, large in _describe_runs(problem, about, fixes, begins, runs, one):
+            spans |= {name: (*spans.get(name, ()), (first, last)) for name in wrong}
+            each &= large
+        out.append(WrongSegments(one.log_odds, spans, each))
+    return float(np.sum(forward.log_likelihood)), out
+
+
+def _list_likeliest(runs: _Runs) -> list[_Set]:
+    """The empty set and the likeliest sets of each size, by forward selection."""
+    out = beam = [runs.begin()]
     while beam:
         more: dict[frozenset[tuple[int, int]], tuple[float, _Set, tuple[float, int, int]]] = {}
         for one in beam:
@@ -155,21 +209,29 @@ def find_wrong_segments(
                 more.setdefault(one.chosen | {added[1:]}, (one.log_odds + added[0], one, added))
         likeliest = sorted(more.values(), key=lambda some: -some[0])[:_BEAM]
         beam = [runs.add(one, *added) for _, one, added in likeliest]
-        best = max([best, *beam[:1]], key=lambda one: one.log_odds)
-    if not best.chosen:
-        return []
-    t = problem.t[np.unique(np.concatenate([rows.keyframe for rows in fixes]))]
-    ordered = sorted(best.chosen, key=lambda run: int(runs.first[run[0]]))
-    out = []
-    for (j, _), error in zip(ordered, runs.estimate(ordered), strict=True):
-        own = t[(t >= begins[runs.first[j]]) & (t < begins[runs.behind[j]])]
-        speed = float(np.median(np.linalg.norm(about.states.v[np.isin(problem.t, own)], axis=1)))
-        if any(
+        out = [*out, *beam]
+    return out
+
+
+def _describe_runs(
+    problem: Problem, about: Points, fixes: list[Constraint], begins: Array, runs: _Runs, one: _Set
+) -> list[tuple[list[str], float, float, bool]]:
+    """Of each run of a set: the constraints that are wrong, first and last fix (s), and whether its error is large."""
+    t, m = problem.t[np.unique(np.concatenate([rows.keyframe for rows in fixes]))], len(fixes[0].axes)
+    ordered = sorted(one.chosen, key=lambda run: int(runs.first[run[0]]))
+    bounds, out = np.append(begins, np.inf), []
+    for (j, kind), error in zip(ordered, runs.estimate(ordered) if ordered else [], strict=True):
+        own = t[(t >= begins[runs.first[j]]) & (t < bounds[runs.behind[j]])]
+        driven = t if runs.to_end else own  # an error is as large in one part as its opposite in all others
+        speed = float(np.median(np.linalg.norm(about.states.v[np.isin(problem.t, driven)], axis=1)))
+        places = {rows.name: 2 * m * i for i, rows in enumerate(fixes)}
+        large = any(
             is_large(error[at : at + m] + grown * error[at + m : at + 2 * m], rows, speed)
-            for rows, at in zip(fixes, range(0, len(error), 2 * m), strict=True)
+            for rows, at in zip(fixes, places.values(), strict=True)
             for grown in (0.0, (own[-1] - own[0]) / MINUTE)
-        ):
-            out.append((float(own[0]), float(own[-1])))
+        )
+        wrong = [name for name, at in places.items() if at in runs.kinds[kind]]
+        out.append((wrong, float(own[0]), float(own[-1]), large))
     return out
 
 

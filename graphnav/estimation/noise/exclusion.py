@@ -38,7 +38,8 @@ are suspected instead, the same way, and the likeliest stands, of both and of th
 that leaves other spans out, so are the fixes before these. An estimate without the fixes before that explains the rest
 no better than what stands has lost: those fixes agree with the latter, and would have to be explained as wrong.
 Figures bent by a fault find other segments wrong than those estimated without it: the segments that are wrong by the
-figures of what stands are suspected last.
+figures of what stands are suspected last. Which part of a drive is right is decided at the end
+(`graphnav.estimation.noise.rivals`).
 """
 
 from __future__ import annotations
@@ -70,6 +71,7 @@ from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.noise.moments import collect_imu_moments
 from graphnav.estimation.noise.outliers import may_pay
 from graphnav.estimation.noise.readmission import readmit
+from graphnav.estimation.noise.rivals import choose_likeliest
 from graphnav.estimation.noise.spans import (
     Span,
     are_covered,
@@ -333,11 +335,11 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     found : with all intervals alike.
     """
     best = _disturb_intervals(base, found)
-    if found.rival is None:
-        return best
-    other = _disturb_intervals(base, found.rival)
-    sure = log_evidence(base, best) > log_evidence(base, other) + best.gained_by_chance
-    return replace(best if sure else other, passes=best.passes + other.passes - found.rival.passes, rival=None)
+    if found.rival is not None:
+        other = _disturb_intervals(base, found.rival)
+        sure = log_evidence(base, best) > log_evidence(base, other) + best.gained_by_chance
+        best = replace(best if sure else other, passes=best.passes + other.passes - found.rival.passes, rival=None)
+    return choose_likeliest(base, best)
 
 
 def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:

@@ -9,6 +9,7 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
                         (s) of intervals between keyframes with more white noise, and 1 over its variance's factor
     tails               by constraint: degrees of freedom of the tails of its rows' errors
     excluded            by constraint: [begin, end] (s) of spans of faulty rows
+    rivals              what may be wrong instead, if anything: each with its probability and what is excluded by it
     span_weights        by constraint: [begin, end, weight] of those that are used after all, with less information
     false_stops         [begin, end] (s) of spans that are no stops, whatever the detectors say, if there are any
     spacing             s between the fixes that are used, 0 for all
@@ -56,6 +57,7 @@ from graphnav.estimation.noise.model import (
     INTERVALS,
     FreedConstant,
     NoiseModel,
+    Rival,
     RowWeights,
     StampOffsets,
     VarianceComponent,
@@ -81,20 +83,9 @@ _FREED = {
     "clock_rate": (CLOCK_RATE, 1, _LARGEST_RATE, "s/s, of the clocks of IMU and receiver"),
 }
 _KEYS = (
-    "mode",
-    "pieces",
-    "figures",
-    "correlation_times",
-    "weights",
-    "tails",
-    "excluded",
-    "span_weights",
-    "false_stops",
-    "searched",
-    "spacing",
-    "stamps",
-    *_FREED,
-)
+    "mode", "pieces", "figures", "correlation_times", "weights", "tails", "excluded", "rivals", "span_weights",
+    "false_stops", "searched", "spacing", "stamps", *_FREED,
+)  # fmt: skip
 _LEAST_SIGMA = 1e-9  # of what is the most: nothing is better known
 _FIGURE_KEYS = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
@@ -109,6 +100,7 @@ def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
     ----------
     mode : what `noise.mode` of the settings was.
     """
+    rivals = [{"probability": float(x.probability), "excluded": _list_spans(x.excluded)} for x in noise.rivals]
     return {
         "mode": mode,
         "figures": {
@@ -125,17 +117,22 @@ def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
             if len(some.t)
         },
         "tails": {name: float(index) for name, index in noise.tails.items()},
-        "excluded": {name: [[float(a), float(b)] for a, b in spans] for name, spans in noise.excluded.items() if spans},
+        "excluded": _list_spans(noise.excluded),
         "spacing": float(noise.spacing),
         "stamps": {name: float(getattr(noise.stamps, name)) for name in _STAMPS},
         "span_weights": {name: [[*map(float, one)] for one in spans] for name, spans in noise.span_weights.items()},
         **({"false_stops": [[float(a), float(b)] for a, b in noise.false_stops]} if noise.false_stops else {}),
         **({"searched": True} if noise.searched else {}),
+        **({"rivals": rivals} if rivals else {}),
     } | {
         key: {of: list(getattr(noise.freed[name], of)) for of in _PRIOR}
         for key, (name, *_) in _FREED.items()
         if name in noise.freed
     }
+
+
+def _list_spans(excluded: Mapping[str, tuple[tuple[float, float], ...]]) -> dict[str, list[list[float]]]:
+    return {name: [[float(a), float(b)] for a, b in spans] for name, spans in excluded.items() if spans}
 
 
 def write_noise(path: str | Path, noise: NoiseModel, mode: str = "estimated") -> Path:
@@ -249,7 +246,18 @@ class _Reader:
             self.read_each(values, "tails", constraints, self.read_tail),
             self.read_spans("noise.false_stops", values.get("false_stops", [])),
             self.read_flag("noise.searched", values.get("searched", False)),
+            self.read_rivals("noise.rivals", values.get("rivals", []), constraints),
         ), mode
+
+    def read_rivals(self, key: str, value: Any, constraints: list[str]) -> tuple[Rival, ...]:
+        if not isinstance(value, list) or not all(isinstance(one, Mapping) for one in value):
+            raise self.make_error(key, value, "must be a list of tables")
+        out = []
+        for one in value:
+            self.read_names(one, ("probability", "excluded"), key)
+            p = self.read_number(f"{key}.probability", one.get("probability"), 0.0, 1.0, "a probability")
+            out.append(Rival(p, self.read_each(one, "excluded", constraints, self.read_spans)))
+        return tuple(out)
 
     def read_flag(self, key: str, value: Any) -> bool:
         if not isinstance(value, bool):

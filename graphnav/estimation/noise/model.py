@@ -69,6 +69,14 @@ class FreedConstant:
 
 
 @dataclass(frozen=True)
+class Rival:
+    """Spans of fixes that may be wrong instead of those that a noise model excludes."""
+
+    probability: float  # that these are
+    excluded: Mapping[str, tuple[tuple[float, float], ...]]  # spans (s) by constraint
+
+
+@dataclass(frozen=True)
 class NoiseModel:
     """Noise model of all sensors; whatever it does not name is as stated."""
 
@@ -85,6 +93,7 @@ class NoiseModel:
     tails: Mapping[str, float] = field(default_factory=dict)
     false_stops: tuple[tuple[float, float], ...] = ()  # spans (s) in which the platform moves, whatever detectors say
     searched: bool = False  # whether initial points are searched for, because the filter's lead to a worse optimum
+    rivals: tuple[Rival, ...] = ()  # of `excluded`, nearly as likely (`graphnav.estimation.noise.rivals`)
 
     def get_factor(self, group: str, missing: float) -> float:
         """The factor on the variance of a group.
