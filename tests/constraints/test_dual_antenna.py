@@ -101,7 +101,7 @@ def test_its_heading_is_known_live_before_it_moves(standing):
 
 def test_on_the_move_readings_tell_no_start(drive):
     assert measure_baseline_heading(drive, SETTINGS, np.empty((0, 2))) is None
-    assert measure_baseline_heading(drive, SETTINGS, None) is None
+    assert measure_baseline_heading(drive, SETTINGS, None) is not None  # as long as nobody has looked for stops
     far = drive.crop(10.0, 30.0)
     assert measure_baseline_heading(far, SETTINGS, np.array([[drive.start + 15.0, drive.start + 20.0]])) is None
 
