@@ -91,11 +91,14 @@ def find_first_stop_end(recording: Recording, stationary: Array) -> float:
 
 def _find_stand_end(recording: Recording, stationary: Array, begin: float) -> float:
     """End (s) of the stand at the start: by the detectors, or, where no fix from the start on shows motion before
-    `begin`, as far as the IMU is quiet. That alone is no stand: a steady drive shakes no more than an idle engine.
+    `begin` and no wheel turns, as far as the IMU is quiet. That alone is no stand: a steady drive shakes no more than
+    an idle engine.
     """
-    gnss, detected = recording.gnss, find_first_stop_end(recording, stationary)
+    gnss, odometer, detected = recording.gnss, recording.odometer, find_first_stop_end(recording, stationary)
     if gnss is None or not len(gnss.t) or gnss.t[0] > recording.start + LEVELLING:
         return detected
+    if odometer is not None and (turning := np.abs(odometer.speed) > STANDING).any():
+        begin = min(begin, float(odometer.t[np.argmax(turning)]))
     return max(detected, _find_quiet_end(recording, begin))
 
 
