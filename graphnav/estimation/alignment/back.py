@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import Note
@@ -85,7 +86,7 @@ def carry_back(
 
 def find_first_stop_end(recording: Recording, stationary: Array) -> float:
     """End (s) of the stop that a recording begins with, of `stationary` (N, 2) s; its start where there is none."""
-    first = recording.start + LEVELLING
+    first = float(recording.imu.t[0]) + SAME_TIME
     return float(max((b for a, b in stationary if a <= first), default=recording.start))
 
 
