@@ -5,6 +5,7 @@ stops.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -31,6 +32,7 @@ from graphnav.estimation.noise.left_out import drop_excluded
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.problem import Problem, build_problem
+from graphnav.estimation.unknown_heading import choose_heading
 from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
 
@@ -40,9 +42,10 @@ _FAR_AWAY = 100.0  # m, error of single fixes in a city
 
 @dataclass
 class Clock:
-    """Time used by each stage, s."""
+    """Time used by each stage, s, and passes of filter and smoother that are counted nowhere else."""
 
     seconds: dict[str, float] = field(default_factory=dict)
+    passes: Counter[str] = field(default_factory=Counter)
 
     def add(self, seconds: Mapping[str, float]) -> None:
         """Add the time of stages that was counted elsewhere."""
@@ -119,10 +122,12 @@ class ProblemBuilder:
                 self.used, self.settings, self.frame, start.state, start_sigma(start), detections.stationary,
                 speed=self.averaging.get_result(), parts_of_noise=parts,
             )  # fmt: skip
-        if aligned.motion is None and self.recording.placed and self.settings.alignment.heading is None:
-            # linearised at an arbitrary heading, a direction of travel would make an unknown heading appear known
-            rows = tuple(c for c in problem.constraints if not c.of_wheels)
-            problem = replace(problem, constraints=rows)
+        if start.heading_unknown:
+            with self.clock.count_time("alignment"):
+                problem = choose_heading(problem, self.clock.passes)
+            mean = problem.prior.mean
+            assert mean is not None
+            aligned = replace(aligned, state=mean, sigma=problem.prior.sigma[0])
         problem = replace(problem, notes=(*self.notes, *problem.notes))
         problem, carriers = split_carriers(problem, GnssPhase)  # the noise model depends on the codes
         return BuiltProblem(problem, carriers, aligned, detections)

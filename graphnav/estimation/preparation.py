@@ -63,6 +63,7 @@ from graphnav.estimation.solvers.passes import (
 )
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.spread import compare_rivals
+from graphnav.estimation.unknown_heading import compare_headings
 from graphnav.recording import Recording
 
 _Passes = tuple[FilterPass, SmootherPass, dict[str, float]]  # and the seconds that they took, by stage
@@ -200,7 +201,7 @@ def begin_preparation(
     every = ProblemBuilder(recording, recording, settings, frame, clock, averaging, false_stops)
     detections = detections.without(false_stops)
     aligned = every.align(recording, detections.stationary)
-    unaided = aligned.motion is None or not settings.gnss.position
+    unaided = not recording.placed or not settings.gnss.position
     stated = noise is None and (settings.noise.mode == "stated" or unaided)
     larger = stated and settings.noise.mode != "stated" and recording.platform == "foot"
     if stated:
@@ -298,6 +299,10 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
     passes.update(filter=1, smoother=1)
     spread, doubts = compare_rivals(built.problem, noise, problem, smoothed)
     passes.update(filter=len(noise.rivals), smoother=len(noise.rivals))
+    if aligned.heading_unknown and settings.alignment.heading is None:
+        with clock.count_time("smoother"):
+            around = compare_headings(problem, smoothed, passes)
+        spread = around if spread is None else spread + around
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))
     notes = (*doubts, *notes)
     epochs, arcs = dict[str, Array](), {"": CarrierArcs()}
@@ -310,6 +315,7 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
         notes, epochs = (*notes, *fixed.notes), {"ekf": fixed.filtered_epochs, "": fixed.smoothed_epochs}
         arcs = {"ekf": fixed.filtered_arcs, "": fixed.smoothed_arcs}
     start = use_known_heading(aligned, settings)
+    passes.update(clock.passes)
     return Prepared(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
         evidence, ahead, begun.unmeasured, spread,

@@ -123,9 +123,8 @@ def _describe_vague(solution: Solution) -> Note | None:
     track = solution.trajectory(joint=False)
     moving = np.linalg.norm(solution.states.v, axis=1) > _MOVING
     if not moving.any() and any(get_key(note) == "alignment.no_motion" for note in solution.notes):
-        # linearisation at noisy states yields spurious heading information: at rest it adds up to a sigma of degrees
         words = (
-            "without motion it is not observable, whatever its sigma; a lever arm carries the error into the position"
+            "without motion it is not observable, as its sigma says, and what a lever arm makes of it in the position"
         )
         return Note("doubt.heading", f"The heading cannot be trusted: {words}")
     if "gnss_position" not in solution.records or track.sd_rph is None or track.sd_p is None or moving.mean() < 0.5:

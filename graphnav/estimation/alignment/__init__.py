@@ -92,6 +92,7 @@ def use_known_heading(found: Alignment, settings: Settings) -> Alignment:
         found,
         state=replace(found.state, R_nb=rotation.from_rph(rph)[None]),
         sigma=sigma,
+        heading_unknown=False,
         notes=(
             *found.notes,
             Note(

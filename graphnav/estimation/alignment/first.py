@@ -28,6 +28,7 @@ class Alignment:
     motion: float | None = None  # s, from when on the heading is known: the first motion, or two antennas; None: never
     until: float | None = None  # s, end of the span that a filter processes twice: the span of motion, or first steps
     headings: tuple[float, ...] = ()  # rad, at `motion`, of all minima of the problem over the span of motion
+    heading_unknown: bool = False  # nothing tells it: one of all around (`graphnav.estimation.unknown_heading`)
 
     @property
     def rph(self) -> Array:

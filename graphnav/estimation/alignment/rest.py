@@ -61,10 +61,9 @@ def level_at_rest(recording: Recording, settings: Settings, frame: LocalFrame, s
         sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
         known = measure_baseline_heading(recording, settings, stationary)
         if known is None:
-            without = ", so nothing ties it to the direction of travel" if recording.platform == "vehicle" else ""
             note = Note(
                 "alignment.no_motion",
-                f"no motion in the GNSS fixes: levelled at the start, heading unknown{without}",
+                "no motion in the GNSS fixes: levelled at the start, heading unknown: solved from headings all around",
             )
         else:
             sd_heading = settings.alignment.prior_inflation * known.sigma
@@ -94,7 +93,8 @@ def level_at_rest(recording: Recording, settings: Settings, frame: LocalFrame, s
     own = np.array([tilt, tilt, np.pi if known is None else known.sigma])
     if known is not None:
         return Alignment(state, sigma, own, (note,), known.until, known.until)
-    return Alignment(state, sigma, own, (note,), until=float(stances[:_OPENING][-1, 1]) if len(stances) else None)
+    until = float(stances[:_OPENING][-1, 1]) if len(stances) else None
+    return Alignment(state, sigma, own, (note,), until=until, heading_unknown=sd_heading == np.pi)
 
 
 def _measure_motion(recording: Recording, seconds: float) -> tuple[float, float]:

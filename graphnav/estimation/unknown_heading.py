@@ -1,0 +1,88 @@
+"""An unknown heading: a mixture of trajectories from headings all around.
+
+Linearised at one heading with a sigma of half a turn, antenna, turn rates and wheels make a filter certain of a heading
+that nothing measured, and of the place that the lever arm has there. So the prior is a sum of Gaussians, all around and
+each narrow enough to be linear in, and so is what is known afterwards (Alspach and Sorenson 1972, "Nonlinear Bayesian
+estimation using Gaussian sum approximations"), each as likely as the evidence says. The likeliest is the solution, and
+the mean square of what all of them differ from it by is in its covariance.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.noise.initial_points import BREAKDOWN
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
+from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, SmootherPass, are_near
+from graphnav.estimation.solvers.rts import smooth_backward
+
+_HEADINGS = int(np.ceil(np.pi / LINEAR_ATTITUDE))  # two sigmas apart, their sum is even to a part in a hundred
+
+
+def choose_heading(problem: Problem, passes: Counter[str]) -> Problem:
+    """The problem with the likeliest of all initial headings, each known to `LINEAR_ATTITUDE`."""
+    first = _start_from(problem, 0.0)
+    smoothed = smooth_backward(first, ekf(first))
+    passes.update(filter=1, smoother=1)
+    best = max(_solve_turned(first, smoothed, passes), key=lambda one: one[1], default=(0.0,))
+    return _start_from(problem, best[0])
+
+
+def compare_headings(problem: Problem, smoothed: SmootherPass, passes: Counter[str]) -> Array:
+    """What other initial headings add to the covariances (K, 15, 15) of a problem whose heading was chosen."""
+    known = smoothed.P[:, :DIM, :DIM]
+    more, total, reference = np.zeros_like(known), 0.0, None
+    for _, evidence, other in _solve_turned(problem, smoothed, passes):
+        reference = evidence if reference is None else reference
+        share, off = float(np.exp(evidence - reference)), other.states.minus(smoothed.states)
+        more += share * (other.P[:, :DIM, :DIM] - known + off[:, :, None] * off[:, None, :])
+        total += share
+    return more / max(total, 1e-300)
+
+
+def _solve_turned(
+    problem: Problem, about: SmootherPass, passes: Counter[str]
+) -> Iterator[tuple[float, float, SmootherPass]]:
+    """From starts turned all around: the turn (rad), the logarithm of the evidence, the solution.
+
+    Those from which the filter breaks down are left out.
+    """
+    for turn in 2.0 * np.pi * np.arange(_HEADINGS) / _HEADINGS:
+        other = _start_from(problem, float(turn))
+        with contextlib.suppress(*BREAKDOWN):
+            points = Points(_turn(about.states, problem, float(turn)), about.values)
+            forward = refilter(other, points)
+            smoothed = smooth_backward(other, forward)
+            passes.update(filter=1, smoother=1)
+            if not are_near(smoothed, points):  # it has moved, if by less than its fixes tell at once
+                smoothed = smooth_near(other, smoothed)
+                forward = refilter(other, smoothed, whole=False)
+                passes.update(filter=2, smoother=1)
+            yield float(turn), float(np.sum(forward.log_likelihood)), smoothed
+
+
+def _start_from(problem: Problem, turn: float) -> Problem:
+    """The problem with its initial heading turned (rad), and known to `LINEAR_ATTITUDE`."""
+    mean, sigma = problem.prior.mean, problem.prior.sigma.copy()
+    assert mean is not None
+    sigma[0, 2] = LINEAR_ATTITUDE
+    return replace(problem, prior=replace(problem.prior, mean=_turn(mean, problem, turn), sigma=sigma))
+
+
+def _turn(states: States, problem: Problem, turn: float) -> States:
+    """States turned by an angle (rad) about the vertical through the antenna at the start."""
+    mean, gnss = problem.prior.mean, problem.recording.gnss
+    assert mean is not None
+    assert gnss is not None
+    centre, Rz = mean.p[0] + mean.R_nb[0] @ gnss.lever_arm, rotation.exp(np.array([[0.0, 0.0, turn]]))[0]
+    return replace(states, R_nb=Rz @ states.R_nb, p=centre + (states.p - centre) @ Rz.T, v=states.v @ Rz.T)
