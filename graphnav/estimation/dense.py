@@ -3,20 +3,19 @@
 A filter's state between keyframes is that prediction. A smoother knows the next keyframe too; the difference between
 prediction and that keyframe is distributed over the interval so that position, velocity and attitude remain consistent:
 that of position is the cubic that starts at zero and ends with the differences of position and velocity, that of
-velocity its derivative, attitude and biases are linear. Covariances are interpolated linearly, and what white noise of
-the IMU adds between the ends comes on top, alike along all axes: with s the fraction of an interval of length T, q_v
-and q_theta the variances that it has added at its end, to a filter
+velocity its derivative, attitude and biases are linear.
 
-    theta: q_theta s              v: q_v s                               p: q_v T^2 s^3 / 3
-
-and to a smoother, which knows both ends (the bridges of a Wiener process and of an integrated one)
+Covariances are interpolated linearly: a filter's to that of the prediction of the next keyframe, a smoother's to that
+of the next keyframe. To a smoother's, what white noise of the IMU adds between the ends comes on top, alike along all
+axes (the bridges of a Wiener process and of an integrated one): with s the fraction of an interval of length T, q_v and
+q_theta the variances that it has added at its end
 
     theta: q_theta s (1 - s)      v: q_v s (1 - s) (1 - 3 s (1 - s))     p: q_v T^2 (s (1 - s))^3 / 3
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -77,13 +76,24 @@ class Dense(AtKeyframes):
     frame: LocalFrame
     ba: Array  # (K-1, 3) biases, scale errors included, of each interval
     bg: Array  # (K-1, 3)
-    smooth: bool
     white: Array  # (2, K-1) q_theta, q_v
+    ahead: Array | None = None  # (K-1, 15, 15) of a filter: predicted at the end of each interval
+
+    def widen(self, covariance: Array) -> Dense:
+        """The same with covariances (K, 15, 15), and what they are more in between as well."""
+        ahead = None if self.ahead is None else self.ahead + (covariance - self.covariance)[1:]
+        return replace(self, covariance=covariance, ahead=ahead)
 
     def __call__(self, t: Array) -> tuple[States, Array]:
         """States and covariances (M, 15, 15) at ascending times from `start` to `end`."""
         k, s = self._locate(t)
-        P = _interpolate_covariance(self.covariance, k, s)
+        P, after, w = self.covariance.take(k, axis=0), self._end.take(k, axis=0), s[:, None, None]
+        P *= 1.0 - w
+        after *= w
+        P += after
+        if self.ahead is not None:
+            own = _is_end(s)
+            P[own] = self.covariance[k[own] + 1]
         for name, more in self._add_white(k, s).items():
             at = np.arange(*BLOCKS[name].indices(DIM))
             P[:, at, at] += more[:, None]
@@ -93,23 +103,31 @@ class Dense(AtKeyframes):
         """The same with covariances (6, M) of position, velocity and attitude each by itself."""
         k, s = self._locate(t)
         apart = {name: own.take(k, axis=1) + s * change.take(k, axis=1) for name, (own, change) in self._apart.items()}
+        if self.ahead is not None:
+            exact = np.flatnonzero(_is_end(s))
+            for name, (own, _) in self._apart.items():
+                apart[name][:, exact] = own[:, k[exact] + 1]
         for name, more in self._add_white(k, s).items():
             apart[name][:3] += more
         return self._reach(t, k, s), apart
 
     def _add_white(self, k: Array, s: Array) -> dict[str, Array]:
-        """Variances (M,) of position, velocity and attitude that are not in those of the keyframes."""
+        """Variances (M,) of position, velocity and attitude that a smoother has between its keyframes."""
+        if self.ahead is not None:
+            return {}
         turn, gain = self.white.take(k, axis=1)
-        T = np.diff(self.t)[k]
-        if not self.smooth:
-            s = np.where(np.isclose(s, 1.0, rtol=0.0, atol=1e-9), 0.0, s)  # the keyframe's own
-            return {"theta": turn * s, "v": gain * s, "p": gain * T**2 * s**3 / 3.0}
-        b = s * (1.0 - s)
+        T, b = np.diff(self.t)[k], s * (1.0 - s)
         return {"theta": turn * b, "v": gain * b * (1.0 - 3.0 * b), "p": gain * T**2 * b**3 / 3.0}
+
+    @property
+    def _end(self) -> Array:
+        """(K-1, 15, 15) that covariances are interpolated to."""
+        return self.covariance[1:] if self.ahead is None else self.ahead
 
     @cached_property
     def _apart(self) -> dict[str, tuple[Array, Array]]:
-        return {block: (own, np.diff(own, axis=1)) for block, own in split_covariance(self.covariance).items()}
+        own, end = split_covariance(self.covariance), split_covariance(self._end)
+        return {block: (one, end[block] - one[:, :-1]) for block, one in own.items()}
 
     def _locate(self, t: Array) -> tuple[Array, Array]:
         """The keyframe before each time, and the elapsed fraction of the interval after it."""
@@ -121,12 +139,12 @@ class Dense(AtKeyframes):
         first, t, k, s = self.states[k[:begin]], t[begin:], k[begin:], s[begin:]
         if not len(t):
             return first
-        reached = self._smooth_between(t, k, s) if self.smooth else self._filter_between(t, k, s)
+        reached = self._smooth_between(t, k, s) if self.ahead is None else self._filter_between(t, k, s)
         return States.stack([first, reached]) if begin else reached
 
     def _filter_between(self, t: Array, k: Array, s: Array) -> States:
         reached = self._predict(t)
-        exact = np.flatnonzero(np.isclose(s, 1.0, rtol=0.0, atol=1e-9))
+        exact = np.flatnonzero(_is_end(s))
         for name in States.__dataclass_fields__:
             getattr(reached, name)[exact] = getattr(self.states, name)[k[exact] + 1]
         return reached
@@ -160,18 +178,18 @@ def _distribute(miss: Array, s: Array, T: Array) -> Array:
     return out
 
 
-def _interpolate_covariance(of_keyframes: Array, k: Array, s: Array) -> Array:
-    """Covariances between keyframes k and those behind them."""
-    w = s[:, None, None]
-    out, after = of_keyframes.take(k, axis=0), of_keyframes.take(k + 1, axis=0)
-    out *= 1.0 - w
-    after *= w
-    out += after
-    return out
+def _is_end(s: Array) -> Array:
+    """Of fractions of intervals: which are at the next keyframe."""
+    return np.isclose(s, 1.0, rtol=0.0, atol=1e-9)
 
 
-def make_dense(problem: Problem, states: States, covariance: Array, scale: Array | None, smooth: bool) -> Dense:
-    """Make the states between keyframes of a solution; `scale` is (k,) or, for a filter, (K, k) as of each keyframe."""
+def make_dense(
+    problem: Problem, states: States, covariance: Array, scale: Array | None, ahead: Array | None = None
+) -> Dense:
+    """Make the states between keyframes of a solution; `scale` is (k,) or, for a filter, (K, k) as of each keyframe.
+
+    `ahead` as of `Dense`.
+    """
     ba, bg = states.ba[:-1], states.bg[:-1]
     if scale is not None:
         scale = np.broadcast_to(scale, (len(states), scale.shape[-1]))[:-1]
@@ -179,4 +197,4 @@ def make_dense(problem: Problem, states: States, covariance: Array, scale: Array
         ba, bg = ba + of_accel, bg + of_gyro
     noise = np.diagonal(problem.intervals.covariance, axis1=1, axis2=2)
     white = np.stack([noise[:, BLOCKS[name]].mean(axis=1) for name in ("theta", "v")])
-    return Dense(problem.t, states, covariance, problem.samples, problem.frame, ba, bg, smooth, white)
+    return Dense(problem.t, states, covariance, problem.samples, problem.frame, ba, bg, white, ahead)

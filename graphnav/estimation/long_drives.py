@@ -117,7 +117,8 @@ class _Span:
         before, behind = slice(every.start, inside.start), slice(inside.stop, every.stop)
         bare = replace(
             whole, t=whole.t[every].copy(), states=States.stack([whole.states[every]]), ba=whole.ba[steps].copy(),
-            bg=whole.bg[steps].copy(), covariance=np.empty((0, DIM, DIM)),
+            bg=whole.bg[steps].copy(), covariance=np.empty((0, DIM, DIM)), white=whole.white[:, steps].copy(),
+            ahead=None if whole.ahead is None else whole.ahead[steps].copy(),
         )  # fmt: skip
         P, start, end = whole.covariance, max(whole.start, start), min(whole.end, end)
         return cls(bare, P[before].copy(), own, P[behind].copy(), start, end)

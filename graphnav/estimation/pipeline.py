@@ -348,7 +348,7 @@ def _widen(solution: Solution, spread: Array | None) -> Solution:
     """The solution with what an unknown heading makes of its positions to second order, and what may be wrong."""
     P = add_curvature(solution.covariance, solution.states)
     P = P if spread is None else P + spread
-    between = (replace(one, covariance=P) if isinstance(one, Dense) else one for one in solution.between)
+    between = (one.widen(P) if isinstance(one, Dense) else one for one in solution.between)
     return replace(solution, covariance=P, between=tuple(between))
 
 

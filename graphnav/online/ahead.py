@@ -78,7 +78,7 @@ def predict_since(
     before = add_curvature(newest.covariance[None, :DIM, :DIM], start)[0]
     ends, both = np.array([T, now.t]), np.stack([before, now.covariance])
     states = States.stack([start, now.state])
-    between = Dense(ends, states, both, bridge_gaps(imu), frame, ba, bg, False, np.zeros((2, len(ba))))
+    between = Dense(ends, states, both, bridge_gaps(imu), frame, ba, bg, np.zeros((2, len(ba))), both[1:])
     return t, *between(t)
 
 

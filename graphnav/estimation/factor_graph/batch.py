@@ -95,7 +95,7 @@ def batch(
                 )
             )
     return make_solution(
-        problem, "batch", points, covariance, sigma, smooth=True, notes=(*found.notes, *notes), records=records,
+        problem, "batch", points, covariance, sigma, notes=(*found.notes, *notes), records=records,
         iterations=found.iterations, cost=found.cost, stopped=found.stopped,
         timings={"batch": solved - began, "covariances": done - solved},
     )  # fmt: skip

@@ -66,7 +66,7 @@ def find_filled_gaps(problem: Problem, opening: float | None) -> tuple[Array, in
     S = (one.covariance + one.sigma[:, :, None] ** 2 * np.eye(3))[own]
     begin, end = gaps[np.searchsorted(gaps[:, 0], t[own]) - 1].T
     times, index = np.unique(np.concatenate([begin, t[own], end]), return_inverse=True)
-    states, _ = make_dense(used, smoothed.states, smoothed.P[:, :DIM, :DIM], None, smooth=True)(times)
+    states, _ = make_dense(used, smoothed.states, smoothed.P[:, :DIM, :DIM], None)(times)
     first, path, last = np.split((states.p + mv(states.R_nb, rows.lever_arm))[index], 3)
     chord = first + ((t[own] - begin) / (end - begin))[:, None] * (last - first)
     e, d = rows.p_n[own] - path, chord - path

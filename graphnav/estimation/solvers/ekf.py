@@ -90,12 +90,13 @@ def ekf(
     one = _run_forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
     # a copy: a view would keep the parameters' covariance in memory
-    P = one.P[:, :DIM, :DIM].copy()
+    P, ahead = (every[:, :DIM, :DIM].copy() for every in (one.P, one.P_predicted[1:]))
     if about is not None:
         n = len(about.values) - 1
         P[:n] = transport_covariance(P[:n], about.states[:n], one.states[:n])
+        ahead[: n - 1] = transport_covariance(ahead[: n - 1], about.states[1:n], one.predicted.states[1:n])
     solution = make_solution(
-        problem, "ekf", one, P, compute_sigmas(one.P), smooth=False,
+        problem, "ekf", one, P, compute_sigmas(one.P), ahead,
         records={name: r.record(problem) for name, r in one.records.items()},
         iterations=1, stopped="one pass forward over all keyframes", timings={"filter": seconds},
     )  # fmt: skip

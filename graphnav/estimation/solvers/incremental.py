@@ -157,7 +157,7 @@ def solve_in_turn(engine: Incremental, progress: Progress | None) -> Solution:
         Note("solver.relinearised", f"{format_count(again, 'keyframe')} relinearised"),
     )
     return make_solution(
-        problem, solver, at, covariance, sigma, smooth=True, notes=notes, records=records,
+        problem, solver, at, covariance, sigma, notes=notes, records=records,
         iterations=1, cost=compute_cost_at(problem, at), stopped=f"every keyframe settled with {whole}",
         timings={solver: elapsed},
     )  # fmt: skip

@@ -211,7 +211,7 @@ def carry_points(points: Points, before: Problem, after: Problem, anew: Collecti
     `anew` are the parameters that begin with their expected values.
     """
     none = np.zeros((len(before.t), DIM, DIM))  # covariances, which are not wanted between keyframes either
-    between = make_dense(before, points.states, none, scale_at(before.columns, points.values), smooth=True)
+    between = make_dense(before, points.states, none, scale_at(before.columns, points.values))
     t = np.clip(after.t, before.t[0], before.t[-1])
     states, nearest = between(t)[0], pick_nearest(before.t, after.t)
     states = replace(states, p=states.p + (after.t - t)[:, None] * states.v)
@@ -238,7 +238,7 @@ def make_solution(
     points: Points,
     covariance: Array,
     sigma: Array,
-    smooth: bool,
+    ahead: Array | None = None,
     notes: tuple[str, ...] = (),
     **found: Any,
 ) -> Solution:
@@ -247,7 +247,7 @@ def make_solution(
     Parameters
     ----------
     sigma : (K, D-15) of parameters.
-    smooth : whether they know the future, so that states between them do.
+    ahead : (K-1, 15, 15) of a filter, whose states between them do not know the future: covariances of the predictions.
     found : other fields of the solution.
     """
     scale = scale_at(problem.columns, points.values)
@@ -256,7 +256,7 @@ def make_solution(
         counts={"initial_prior": 1, "imu": len(problem.t) - 1, **{c.name: len(c) for c in problem.constraints}},
         notes=(*problem.notes, *notes),
         graphs=(SolvedProblem(problem, points.states, points.select_nodes(problem)),),
-        between=(make_dense(problem, points.states, covariance, scale, smooth=smooth),),
+        between=(make_dense(problem, points.states, covariance, scale, ahead),),
         **found,
     )  # fmt: skip
 

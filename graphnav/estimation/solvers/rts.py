@@ -196,7 +196,7 @@ def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None
     covariance = found.P[:, :DIM, :DIM].copy()  # a copy: a view would keep the parameters' covariance in memory
     seconds = time.perf_counter() - began
     return make_solution(
-        problem, "rts", found, covariance, compute_sigmas(found.P), smooth=True, records=records, iterations=1,
+        problem, "rts", found, covariance, compute_sigmas(found.P), records=records, iterations=1,
         stopped="one pass forward and one back",
         timings={**forward.solution.timings, "smoother": seconds},
     )  # fmt: skip
