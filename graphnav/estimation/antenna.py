@@ -254,7 +254,7 @@ def _smooth_with_open_arms(recording: Recording) -> tuple[Problem, SmootherPass]
     base = build_problem(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)
     try:
         tell("noise")
-        found = estimate_noise(base, aligned.until)
+        found = estimate_noise(base, aligned.opening)
     except np.linalg.LinAlgError as error:
         raise explain_singular(error) from None
     problem = apply_noise(base, found.noise)

@@ -70,13 +70,13 @@ def estimate_first(built: BuiltProblem, progress: Progress | None, before: Joint
     """The same with all constants as stated; `before` is the estimate with other stamps, if any."""
     if before is not None:
         return built, estimate_moved(built.problem, before, progress)
-    return built, estimate_as_stated(built.problem, built.aligned.until, progress)
+    return built, estimate_as_stated(built.problem, built.aligned.opening, progress)
 
 
 def free_wrong_constants(builder: ProblemBuilder, first: Estimated, progress: Progress | None) -> Estimated:
     """The same with the constants free that the drive contradicts."""
     built, found = first
-    return built, free_contradicted(found, builder.settings.gnss, built.aligned.until, progress)
+    return built, free_contradicted(found, builder.settings.gnss, built.aligned.opening, progress)
 
 
 def leave_out_contradicted_stops(
@@ -171,13 +171,13 @@ def _find(builder: ProblemBuilder, begun: Estimated, progress: Progress | None) 
     measurements.
     """
     settings, built = builder.settings.gnss, begun[0]
-    found = leave_out_jointly(begun[1], settings, built.aligned.until, progress)
-    if found.excluded_share > _MOST_WRONG:
+    found = leave_out_jointly(begun[1], settings, built.aligned.opening, progress)
+    if found.excluded_share > _MOST_WRONG and built.aligned.until is not None:
         with contextlib.suppress(EstimationError):  # no motion later on
             built, found = _start_later(builder, begun, found, progress)
     if found.noise.excluded:
         built, found = _start_without(builder, built, found, progress)
-    found = revise_jointly(found, settings, built.aligned.until, progress)
+    found = revise_jointly(found, settings, built.aligned.opening, progress)
     return _start_anew(builder, built, found) if found.freed else (built, found)
 
 
@@ -186,13 +186,13 @@ def _start_later(
 ) -> Estimated:
     """The same with a start by the fixes behind those that the alignment used, if it contradicts fewer of them."""
     settings, later = builder.settings.gnss, builder.build_later(begun[0])
-    other = begin_jointly(later.problem, settings, later.aligned.until, progress)
+    other = begin_jointly(later.problem, settings, later.aligned.opening, progress)
     passes = found.estimate.passes
     # where all measurements agree no better with that start, it is not what is wrong
     comparable = np.array_equal(later.problem.t, begun[0].problem.t)
     if comparable and other.compute_evidence() <= begun[1].compute_evidence() + other.estimate.gained_by_chance:
         return begun[0], found.count(passes + other.estimate.passes)
-    other = leave_out_jointly(other, settings, later.aligned.until, progress)
+    other = leave_out_jointly(other, settings, later.aligned.opening, progress)
     passes = passes + other.estimate.passes
     fewer = other.excluded_share < found.excluded_share
     return (later, other.count(passes)) if fewer else (begun[0], found.count(passes))
@@ -211,7 +211,7 @@ def _start_without(
     def estimate(
         before: NoiseEstimate, near: tuple[Points, Problem] | None = None, known: NoiseEstimate | None = None
     ) -> NoiseEstimate:
-        return estimate_noise(again.base, without.aligned.until, before.noise, near, progress, known=known)
+        return estimate_noise(again.base, without.aligned.opening, before.noise, near, progress, known=known)
 
     def go_on(before: NoiseEstimate) -> NoiseEstimate:
         if not same:
@@ -241,7 +241,7 @@ def _start_anew(
     again = replace(found, stated=anew.problem, estimate=replace(found.estimate, whole_evidence=None))
     if np.array_equal(anew.problem.t, built.problem.t):
         return anew, again
-    best = estimate_noise(again.base, anew.aligned.until, found.estimate.noise)
+    best = estimate_noise(again.base, anew.aligned.opening, found.estimate.noise)
     return anew, replace(again, estimate=best).count(found.estimate.passes + best.passes)
 
 

@@ -283,7 +283,7 @@ def _solve(
             keyframe=problem.prior.keyframe, mean=found.start.state, sigma=start_sigma(found.start)[None]
         )
         problem = replace(problem, prior=prior)
-        forward = ekf(problem, progress, found.aligned.until)
+        forward = ekf(problem, progress, found.aligned.opening)
         smoothed = smooth_backward(problem, forward, progress)
         passes.update(filter=1, smoother=1)
     out = {"ekf": forward.solution}

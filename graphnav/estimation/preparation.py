@@ -210,7 +210,7 @@ def begin_preparation(
     built = builder.build(aligned, detections, parts=larger or noise != STATED)
     if not as_stated:
         with contextlib.suppress(*BREAKDOWN):
-            gaps, count = find_filled_gaps(apply_noise(built.problem, STATED), aligned.until)
+            gaps, count = find_filled_gaps(apply_noise(built.problem, STATED), aligned.opening)
             passes.update(filter=count, smoother=count)
             if len(gaps):
                 recording, unmeasured = drop_in_gaps(recording, gaps, unmeasured)
@@ -269,18 +269,18 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
         else:
             if foreseen is not None:
                 foreseen.passes.end()
-            forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
+            forward, smoothed = _filter_and_smooth(problem, aligned.opening, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge
-        initial = next(find_initial_points(problem, aligned.until))
+        initial = next(find_initial_points(problem, aligned.opening))
         passes.update(filter=initial.passes, smoother=initial.passes)
-        forward, smoothed = _filter_and_smooth(problem, aligned.until, initial.points, clock, progress)
+        forward, smoothed = _filter_and_smooth(problem, aligned.opening, initial.points, clock, progress)
     if begun.larger:
         with clock.count_time("noise"):
             noise, spent = estimate_bias_walks(built.problem, smoothed)
             passes.update(spent)
         if noise.figures:
             problem = drop_parts(apply_noise(built.problem, noise))
-            forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
+            forward, smoothed = _filter_and_smooth(problem, aligned.opening, None, clock, progress)
             passes.update(filter=1, smoother=1)
     with clock.count_time("smoother"):
         problem = _drop_refused(problem, forward)
@@ -310,7 +310,7 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
     if carriers is not None:
         tell("ambiguities")
         with clock.count_time("ambiguities"):
-            fixed = fix(rest, carriers, smoothed, aligned.until, progress)
+            fixed = fix(rest, carriers, smoothed, aligned.opening, progress)
         problem, forward, smoothed, ahead = fixed.problem, fixed.forward, fixed.smoothed, None
         notes, epochs = (*notes, *fixed.notes), {"ekf": fixed.filtered_epochs, "": fixed.smoothed_epochs}
         arcs = {"ekf": fixed.filtered_arcs, "": fixed.smoothed_arcs}
@@ -328,7 +328,7 @@ def _foresee(built: BuiltProblem, found: JointEstimate) -> Foreseen | None:
         return None
     noise = widen_by_tails(found.base, found.noise)
     problem = drop_parts(apply_noise(found.base, noise))
-    return Foreseen(found.base, noise, problem, begin_beside(partial(_count_filter, problem, built.aligned.until)))
+    return Foreseen(found.base, noise, problem, begin_beside(partial(_count_filter, problem, built.aligned.opening)))
 
 
 def _count_filter(problem: Problem, opening: float | None) -> _Passes:

@@ -80,7 +80,7 @@ def linearise_searched(
     EstimationError
         If the filter breaks down.
     """
-    initials = list(find_initial_points(problem, aligned.until))
+    initials = list(find_initial_points(problem, aligned.opening))
     spent = sum(one.passes for one in initials)
     passes.update(filter=spent, smoother=spent)
     starts = [one.points for one in initials]
@@ -124,7 +124,7 @@ def _linearise_far(
         start: Points = smoothed
         free = replace(problem, constraints=tuple(c for c in problem.constraints if not c.of_wheels))
         with contextlib.suppress(*BREAKDOWN):
-            first = smooth_backward(free, ekf(free, progress, aligned.until))
+            first = smooth_backward(free, ekf(free, progress, aligned.opening))
             start = reuse_points(_minimise(free, first, passes), free, problem)
         passes.update(filter=1, smoother=1)
         return _linearise_at(problem, aligned, _minimise(problem, start, passes), progress, passes)
@@ -134,7 +134,7 @@ def _linearise_far(
         smoothed = smooth_backward(problem, refilter(problem, about, progress), progress)
         if are_near(smoothed, about, LINEAR_ATTITUDE):
             passes.update(filter=1)
-            return ekf(problem, progress, aligned.until, known=smoothed), smoothed, None
+            return ekf(problem, progress, aligned.opening, known=smoothed), smoothed, None
     return _linearise_at(problem, aligned, _solve_batch(problem, smoothed), progress, passes)
 
 
@@ -186,7 +186,7 @@ def _linearise_at(
     """Filter and smooth about points, and these."""
     smoothed = smooth_backward(problem, refilter(problem, found, progress), progress)
     passes.update(filter=2, smoother=1)
-    return ekf(problem, progress, aligned.until, known=smoothed), smoothed, found
+    return ekf(problem, progress, aligned.opening, known=smoothed), smoothed, found
 
 
 def _step(problem: Problem, start: Points) -> Points | None:

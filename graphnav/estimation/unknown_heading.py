@@ -21,12 +21,13 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
+from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, SmootherPass, are_near
 from graphnav.estimation.solvers.rts import smooth_backward
 
 _HEADINGS = int(np.ceil(np.pi / LINEAR_ATTITUDE))  # two sigmas apart, their sum is even to a part in a hundred
+_PASSES = 4  # about the points of the one before, until attitudes stay
 
 
 def choose_heading(problem: Problem, passes: Counter[str]) -> Problem:
@@ -41,17 +42,16 @@ def choose_heading(problem: Problem, passes: Counter[str]) -> Problem:
 def compare_headings(problem: Problem, smoothed: SmootherPass, passes: Counter[str]) -> Array:
     """What other initial headings add to the covariances (K, 15, 15) of a problem whose heading was chosen."""
     known = smoothed.P[:, :DIM, :DIM]
-    more, total, reference = np.zeros_like(known), 0.0, None
+    more, total = np.zeros_like(known), -np.inf  # the logarithm of the sum of all evidences so far
     for _, evidence, other in _solve_turned(problem, smoothed, passes):
-        reference = evidence if reference is None else reference
-        share, off = float(np.exp(evidence - reference)), other.states.minus(smoothed.states)
-        more += share * (other.P[:, :DIM, :DIM] - known + off[:, :, None] * off[:, None, :])
-        total += share
-    return more / max(total, 1e-300)
+        total = float(np.logaddexp(total, evidence))
+        share, off = np.exp(evidence - total), other.states.minus(smoothed.states)
+        more += share * (other.P[:, :DIM, :DIM] - known + off[:, :, None] * off[:, None, :] - more)
+    return more
 
 
 def _solve_turned(
-    problem: Problem, about: SmootherPass, passes: Counter[str]
+    problem: Problem, first: SmootherPass, passes: Counter[str]
 ) -> Iterator[tuple[float, float, SmootherPass]]:
     """From starts turned all around: the turn (rad), the logarithm of the evidence, the solution.
 
@@ -60,15 +60,16 @@ def _solve_turned(
     for turn in 2.0 * np.pi * np.arange(_HEADINGS) / _HEADINGS:
         other = _start_from(problem, float(turn))
         with contextlib.suppress(*BREAKDOWN):
-            points = Points(_turn(about.states, problem, float(turn)), about.values)
-            forward = refilter(other, points)
-            smoothed = smooth_backward(other, forward)
-            passes.update(filter=1, smoother=1)
-            if not are_near(smoothed, points):  # it has moved, if by less than its fixes tell at once
-                smoothed = smooth_near(other, smoothed)
-                forward = refilter(other, smoothed, whole=False)
-                passes.update(filter=2, smoother=1)
-            yield float(turn), float(np.sum(forward.log_likelihood)), smoothed
+            about = Points(_turn(first.states, problem, float(turn)), first.values)
+            for _ in range(_PASSES):
+                forward = refilter(other, about)
+                smoothed, before = smooth_backward(other, forward), about
+                passes.update(filter=1, smoother=1)
+                if are_near(smoothed, before):
+                    break
+                about = smoothed
+            if np.isfinite(evidence := float(np.sum(forward.log_likelihood))):
+                yield float(turn), evidence, smoothed
 
 
 def _start_from(problem: Problem, turn: float) -> Problem:

@@ -26,7 +26,7 @@ class Alignment:
     own_sigma: Array  # (3,) rad, of roll, pitch, heading, the alignment's own
     notes: tuple[str, ...]
     motion: float | None = None  # s, from when on the heading is known: the first motion, or two antennas; None: never
-    until: float | None = None  # s, end of the span that a filter processes twice: the span of motion, or first steps
+    until: float | None = None  # s, end of the span of motion, or of first steps
     headings: tuple[float, ...] = ()  # rad, at `motion`, of all minima of the problem over the span of motion
     heading_unknown: bool = False  # nothing tells it: one of all around (`graphnav.estimation.unknown_heading`)
 
@@ -34,6 +34,15 @@ class Alignment:
     def rph(self) -> Array:
         """Roll, pitch, heading, rad."""
         return rotation.to_rph(self.state.R_nb[0])
+
+    @property
+    def opening(self) -> float | None:
+        """End of what a filter processes twice, s, if anything: all of it where the heading is unknown.
+
+        Where it stands with its tilt and the bias of its accelerometer unknown as well, linearisation at the filter's
+        own points, which change by noise, tells these apart.
+        """
+        return np.inf if self.heading_unknown else self.until
 
     def contradicts(self, other: Alignment) -> bool:
         """Whether another contradicts this one: by its own sigma of attitude, by the prior's of the rest."""
