@@ -104,6 +104,11 @@ CONSTANTS = (
         f"{NOISE}.unmeasured", "_KINK", "steps of rounding: the bound of chance beside a row is by three sigmas", 3.0
     ),
     Constant(f"{FAULTS}.verdicts", "_FEWEST_AGREEING", "fixes that agree by chance", 2.0, whole=True),
+    Constant(f"{NOISE}.rivals", "_STRONG", "odds: less is no strong evidence (Kass and Raftery 1995)"),
+    Constant(f"{NOISE}.rivals", "_JUMPS", "computing: disturbed intervals at which fixes may step", 2.0, whole=True),
+    Constant(f"{NOISE}.rivals", "_NEAR", "fixes: the median of fewer is that of one outlier", 3.0, whole=True),
+    Constant("graphnav.estimation.spread", "_CHANCE", "probability: three sigmas", 10.0),
+    Constant("graphnav.estimation.alignment.back", "_CERTAIN", "prior: one drive in a hundred begins in reverse"),
     Constant("graphnav.estimation.building", "_FAR_AWAY", "m, single fixes in a city"),
     Constant(
         "graphnav.estimation.solvers.passes",

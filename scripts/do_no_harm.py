@@ -178,11 +178,13 @@ def plan(options: argparse.Namespace) -> list[Job]:
 
 
 def withheld_of(part: Recording, length: float) -> tuple[Withheld, ...]:
-    """Spans of fixes to score on: 20 s every 100 s from 40 s on; of a drive shorter than `SHORT`, two of 10 s."""
-    if length < SHORT:  # the first after the motion that the attitude is found from, the last with fixes behind it
-        starts, size = [0.4 * length, 0.75 * length], 10.0
-    else:
-        starts, size = list(np.arange(40.0, part.duration - 20.0, 100.0)), 20.0
+    """Spans of fixes to score on: 20 s every 100 s from 40 s on; of a drive shorter than `SHORT`, or a window that has
+    none of these, two of 10 s.
+    """
+    starts, size = list(np.arange(40.0, part.duration - 20.0, 100.0)), 20.0
+    if length < SHORT or not starts:
+        # the first after the motion that the attitude is found from, the last with fixes behind it
+        starts, size = [0.4 * part.duration, 0.75 * part.duration], 10.0
     return tuple(("gnss", (round(float(s), 1), round(float(s) + size, 1))) for s in starts)
 
 

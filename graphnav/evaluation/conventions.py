@@ -17,17 +17,18 @@ _SCATTER = 0.1  # share of a constant offset below which its scatter shows that 
 _MENDED = 0.3  # ratio of the residuals of two fits below which the second is the right one
 
 
-def find_other_axes(theirs: Array, ours: Array) -> list[Note]:
+def find_other_axes(theirs: Array, ours: Array, sigma: Array | None = None) -> list[Note]:
     """A note where attitudes `theirs` (N, 3, 3) are those of a body with other axes than `ours`, or no attitudes.
 
-    Both turn vectors of the body into one frame; rows with NaN are unknown.
+    Both turn vectors of the body into one frame; rows with NaN are unknown. What a heading may be off by its `sigma`
+    (N,), rad, tells nothing.
     """
     turn = np.swapaxes(ours, -1, -2) @ theirs
     turn = turn[np.isfinite(turn).all(axis=(1, 2))]
     if not len(turn):
         return []
     angle = float(np.median(np.linalg.norm(rotation.log(turn), axis=1)))
-    if angle < _OTHER_AXES:
+    if angle < max(_OTHER_AXES, 0.0 if sigma is None else 3.0 * float(np.median(sigma))):
         return []
     words = "another unit of angles, sense of the heading, or order of a quaternion"
     nearest = np.round(np.median(turn, axis=0))

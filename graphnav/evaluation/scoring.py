@@ -104,7 +104,7 @@ def compute_errors(
         # by the rotation, not the angles: these are strongly nonlinear where a foot points down
         mine, theirs = rotation.from_rph(estimate.rph), rotation.from_rph(seen.rph)
         theta = rotation.log(np.swapaxes(mine, -1, -2) @ theirs)
-        notes += find_other_axes(mine, theirs)
+        notes += find_other_axes(mine, theirs, None if estimate.sd_rph is None else estimate.sd_rph[:, 2])
     notes += find_other_heights(p[:, 2])
 
     cov = fill_covariance(estimate)
