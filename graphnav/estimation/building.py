@@ -124,10 +124,10 @@ class ProblemBuilder:
             )  # fmt: skip
         if start.heading_unknown:
             with self.clock.count_time("alignment"):
-                problem = choose_heading(problem, self.clock.passes)
+                problem, unknown = choose_heading(problem, self.clock.passes)
             mean = problem.prior.mean
             assert mean is not None
-            aligned = replace(aligned, state=mean, sigma=problem.prior.sigma[0])
+            aligned = replace(aligned, state=mean, sigma=problem.prior.sigma[0], heading_unknown=unknown)
         problem = replace(problem, notes=(*self.notes, *problem.notes))
         problem, carriers = split_carriers(problem, GnssPhase)  # the noise model depends on the codes
         return BuiltProblem(problem, carriers, aligned, detections)

@@ -30,13 +30,34 @@ _HEADINGS = int(np.ceil(np.pi / LINEAR_ATTITUDE))  # two sigmas apart, their sum
 _PASSES = 4  # about the points of the one before, until attitudes stay
 
 
-def choose_heading(problem: Problem, passes: Counter[str]) -> Problem:
-    """The problem with the likeliest of all initial headings, each known to `LINEAR_ATTITUDE`."""
+def choose_heading(problem: Problem, passes: Counter[str]) -> tuple[Problem, bool]:
+    """The problem with the likeliest of all initial headings, and whether it is unknown.
+
+    It is known to `LINEAR_ATTITUDE` there; or, where measurements tell it better than that, it is their mean, with a
+    prior as much wider than their sigma as of any alignment.
+    """
     first = _start_from(problem, 0.0)
     smoothed = smooth_backward(first, ekf(first))
     passes.update(filter=1, smoother=1)
-    best = max(_solve_turned(first, smoothed, passes), key=lambda one: one[1], default=(0.0,))
-    return _start_from(problem, best[0])
+    every = [
+        (turn, evidence, *_measure_heading(one.states.R_nb[0], one.P[0, :3, :3]))
+        for turn, evidence, one in _solve_turned(first, smoothed, passes)
+    ]
+    if not every:
+        return first, True
+    turn, evidence, heading, variance = np.array(every).T
+    best = int(np.argmax(evidence))
+    share, off = np.exp(evidence - evidence[best]), rotation.wrap(heading - heading[best])
+    share /= share.sum()
+    mean = float(share @ off)
+    sigma = float(np.sqrt(share @ (variance + (off - mean) ** 2)))
+    if sigma > LINEAR_ATTITUDE:
+        return _start_from(problem, turn[best]), True
+    start = problem.prior.mean
+    assert start is not None
+    # headings are clockwise
+    ahead = _measure_heading(start.R_nb[0], np.eye(3))[0] - heading[best] - mean
+    return _start_from(problem, ahead, problem.settings.alignment.prior_inflation * sigma), False
 
 
 def compare_headings(problem: Problem, smoothed: SmootherPass, passes: Counter[str]) -> Array:
@@ -72,11 +93,17 @@ def _solve_turned(
                 yield float(turn), evidence, smoothed
 
 
-def _start_from(problem: Problem, turn: float) -> Problem:
-    """The problem with its initial heading turned (rad), and known to `LINEAR_ATTITUDE`."""
+def _measure_heading(R_nb: Array, P: Array) -> tuple[float, float]:
+    """Heading, rad, and its variance, by the covariance (3, 3) of an attitude."""
+    up = R_nb[2]
+    return float(rotation.to_rph(R_nb)[2]), float(up @ P @ up)
+
+
+def _start_from(problem: Problem, turn: float, known: float = LINEAR_ATTITUDE) -> Problem:
+    """The problem with its initial heading turned, and known to a sigma, rad."""
     mean, sigma = problem.prior.mean, problem.prior.sigma.copy()
     assert mean is not None
-    sigma[0, 2] = LINEAR_ATTITUDE
+    sigma[0, 2] = known
     return replace(problem, prior=replace(problem.prior, mean=_turn(mean, problem, turn), sigma=sigma))
 
 

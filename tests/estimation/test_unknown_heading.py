@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from graphnav import load, run
 from graphnav.app.scores import score
 from graphnav.config import Settings
 from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import get_key
 from graphnav.core.state import BLOCKS
 from graphnav.estimation.solution import Solution
@@ -71,6 +73,25 @@ def test_wheels_lead_on_in_circles(shared_data: Path) -> None:
         assert np.sqrt(_variance_of_heading(solved[solver], -1)) > np.radians(10.0), solver
         assert summarise(one)["nees_p"] < 4.0, solver
         assert "nhc" in solved[solver].records, solver
+
+
+def test_a_walk_of_three_metres_tells_its_heading(shared_data: Path) -> None:
+    """Real, with simulated fixes of 0.3 m, whose motion may be chance: with all steps they tell where it leads."""
+    walk, rng, sd = load(shared_data / "pyshoe_vicon" / "2017-11-27-11-11-24.toml"), default_rng(4), 0.3
+    truth, frame = walk.truth, LocalFrame(np.array([0.84, 0.19, 500.0]))
+    assert truth is not None
+    assert truth.xyz is not None
+    t = np.arange(np.ceil(truth.t[0]), truth.t[-1])
+    fixes = np.stack([np.interp(t, truth.t, x) for x in truth.xyz.T], axis=1) + rng.normal(0.0, sd, (len(t), 3))
+    gnss = Gnss(t=t, llh=frame.to_llh(fixes), sd=np.full((len(t), 3), sd), lever_arm=np.zeros(3))
+    solution = run(replace(walk, gnss=gnss, truth=None), solvers=("rts",), noise="stated")["rts"]
+    assert "alignment.no_motion" in map(get_key, solution.notes)
+    assert np.sqrt(_variance_of_heading(solution, 0)) < np.radians(6.0)
+    t = truth.t[(truth.t > solution.t[0]) & (truth.t < solution.t[-1])][::50]
+    _, states, P = solution.at(t)
+    off = frame.from_llh(solution.frame.to_llh(states.p)) - np.stack([np.interp(t, truth.t, x) for x in truth.xyz.T], 1)
+    nees = np.mean(np.einsum("ki,ki->k", off[:, :2], np.linalg.solve(P[:, 3:5, 3:5], off[:, :2, None])[..., 0])) / 2.0
+    assert 0.1 < nees < 3.0
 
 
 def test_noise_of_an_imu_at_rest_is_no_scale_error() -> None:

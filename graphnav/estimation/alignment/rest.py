@@ -63,7 +63,7 @@ def level_at_rest(recording: Recording, settings: Settings, frame: LocalFrame, s
         if known is None:
             note = Note(
                 "alignment.no_motion",
-                "no motion in the GNSS fixes: levelled at the start, heading unknown: solved from headings all around",
+                "no motion in the GNSS fixes: levelled at the start, the heading sought all around",
             )
         else:
             sd_heading = settings.alignment.prior_inflation * known.sigma
