@@ -24,7 +24,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LINEAR_OFFSET
-from graphnav.constraints.base import SAME_TIME, Constraint
+from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
 from graphnav.constraints.odometer import ODOMETER_DELAY
 from graphnav.core.interpolation import pick_nearest
@@ -73,35 +73,33 @@ class _Candidate:
         return self.begun.all_passes if self.prepared is None else self.prepared.passes
 
     def compare_evidence(self, other: _Candidate) -> float:
-        """The logarithm of the evidence less that of another, both of as many measurements: with its stamps moved a fix
-        may leave the span of the IMU, and a keyframe with what is assumed there goes with it.
+        """The logarithm of the evidence of the fixes by all other measurements, less that of another candidate, both of
+        the same fixes: with its stamps moved one may leave the span of the IMU. Other rows are at keyframes and, with
+        these elsewhere, of another evidence: those of stops by tens of nats, whatever the stamps.
         """
-        return self._weigh_common(other) - other._weigh_common(self)
+        return self._weigh_fixes(other) - other._weigh_fixes(self)
 
-    def _weigh_common(self, other: _Candidate) -> float:
-        one, their = self.begun.found, other.begun.found
-        assert one is not None
-        assert their is not None
-        theirs = {rows.name: other._list_stamps(their.base, rows) for rows in their.base.constraints}
-        beyond: dict[str, tuple[Span, ...]] = {}
-        for rows in one.base.constraints:
-            t, same = self._list_stamps(one.base, rows), theirs.get(rows.name, np.empty(0))
-            if rows.name in _OWN_STAMPS:
-                apart = np.abs(same[pick_nearest(same, t)] - t) if len(same) else np.full(len(t), np.inf)
-                lacking = apart > 10.0 * SAME_TIME  # both rounded
-            else:  # at keyframes, of which any are alike
-                kept = np.linspace(0.0, len(t) - 1.0, min(len(same), len(t))).round().astype(int)
-                lacking = ~np.isin(np.arange(len(t)), kept)
-            if lacking.any():
-                beyond[rows.name] = tuple((x, x) for x in one.base.t[rows.keyframe][lacking].tolist())
-        return self.log_evidence - self.begun.weigh_measurements(beyond) if beyond else self.log_evidence
+    def _weigh_fixes(self, other: _Candidate) -> float:
+        assert self.begun.found is not None
+        theirs, beyond = other._list_stamps(), dict[str, tuple[Span, ...]]()
+        for name, (own, t) in self._list_stamps().items():
+            same = theirs[name][0] if name in theirs else np.empty(0)
+            apart = np.abs(same[pick_nearest(same, own)] - own) if len(same) else np.full(len(own), np.inf)
+            if (lacking := t[apart > 10.0 * SAME_TIME]).size:  # both rounded
+                beyond[name] = tuple((x, x) for x in lacking.tolist())
+        gained = self.log_evidence - self.begun.found.estimate.log_evidence  # by what is free or left out
+        of_fixes = self.begun.weigh_measurements(dict.fromkeys(_OWN_STAMPS, ((-np.inf, np.inf),)))
+        return gained + of_fixes - (self.begun.weigh_measurements(beyond) if beyond else 0.0)
 
-    def _list_stamps(self, problem: Problem, rows: Constraint) -> Array:
-        """(N,) s, on their own clock, of fixes; of other rows the times of their keyframes."""
-        t, by = problem.t[rows.keyframe], _list_by_constraint(self.offsets)
-        if rows.name not in by:
-            return t
-        return np.asarray(shift_stamps_back(t, by[rows.name], self.offsets.rate, self.offsets.since))
+    def _list_stamps(self) -> dict[str, tuple[Array, Array]]:
+        """(N,) s, stamps of fixes by constraint, on their own clock and that of the IMU."""
+        assert self.begun.found is not None
+        base, stamps, out = self.begun.found.base, self.offsets, dict[str, tuple[Array, Array]]()
+        for rows in base.constraints:
+            if (late := _list_by_constraint(stamps).get(rows.name)) is not None:
+                t = base.t[rows.keyframe]
+                out[rows.name] = np.asarray(shift_stamps_back(t, late, stamps.rate, stamps.since)), t
+        return out
 
 
 # stamp offsets, and what was begun with others, if anything -> the recording with its stamps moved by these
