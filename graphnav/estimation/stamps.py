@@ -4,10 +4,10 @@ A fix whose stamp is off by d is predicted from the state at the stamp, with an 
 within `LINEAR_OFFSET` of it (`graphnav.constraints.gnss`). Farther away a vehicle's acceleration changes otherwise. So
 where an offset is estimated farther than that from where the rows are linearised, the stamps are moved to the estimate,
 that of the clocks' rate with it, and all is estimated again from there, a step of Gauss-Newton, until the estimate
-stays within. Where the clocks of IMU and fixes disagree for certain (`graphnav.recording.checks.clock`), the first step
-is what they disagree by. The stamps as they are remain a candidate: the likelier stands. Stamps are moved before wrong
-measurements are searched for, as late fixes look wrong in every bend, and once more where the search has changed the
-noise model.
+stays within, and the likelier stands. Where the clocks of IMU and fixes disagree for certain
+(`graphnav.recording.checks.clock`), all is begun about what they disagree by, and moved to what is estimated there; the
+stated stamps are tried only where that is near them. Stamps are moved before wrong measurements are searched for,
+as late fixes look wrong in every bend, and once more where the search has changed the noise model.
 
 A solution is on the clock of the IMU, and what it says of fixes is on theirs (`shift_to_own_clocks`).
 """
@@ -135,14 +135,15 @@ def find_stamps(
     def solve_moved(offsets: StampOffsets, before: Begun | None) -> _Candidate:
         return solve(begin_moved(offsets, before), _accept_all)
 
-    as_stated = begin_moved(AS_STATED, None)
-    early = _find(begin_moved, as_stated, None if clock is None else _guess_offsets(clock))
+    early = None if clock is None else _begin_about(begin_moved, _guess_offsets(clock))
+    if early is None:
+        early = _find(begin_moved, begin_moved(AS_STATED, None))
     try:
         found = solve(early, is_offset_far)
     except BREAKDOWN:
-        if early is as_stated:
+        if early.offsets == AS_STATED:
             raise
-        found = solve(as_stated, is_offset_far)
+        found = solve(begin_moved(AS_STATED, None), is_offset_far)
     # wrong measurements may have hidden an offset, or been taken for one
     if found.log_evidence > found.begun.log_evidence + found.begun.gained_by_chance:
         found = _find(solve_moved, found)
@@ -151,14 +152,26 @@ def find_stamps(
     return move_stamps(recording, found.offsets), prepared, found.offsets
 
 
-def _find(move: _Move, plain: _Candidate, guess: StampOffsets | None = None) -> _Candidate:
+def _begin_about(move: _Move, guess: StampOffsets | None) -> _Candidate | None:
+    """What is begun with stamps moved to where their offsets are estimated from a guess; None where these are near what
+    is stated, or do not come about.
+    """
+    if guess is None:
+        return None
+    with contextlib.suppress(*BREAKDOWN):
+        start = move(guess, None)
+        ahead = _estimate_offsets(start, 0.0)  # what is left has the prior of a receiver's, not that of a guess
+        found = _move_until_near(move, start if ahead == guess else move(ahead, start.begun))
+        return found if found is not None and _is_far(found.offsets) else None
+    return None
+
+
+def _find(move: _Move, plain: _Candidate) -> _Candidate:
     """What is likeliest, with its stamps as they are or moved until their offsets are estimated near where they are."""
-    for first in (plain,) if guess is None else (guess, plain):
-        with contextlib.suppress(*BREAKDOWN):  # with stamps that are farther off than before
-            start = move(first, None) if isinstance(first, StampOffsets) else first
-            found = _move_until_near(move, start)
-            if found is not None and found is not plain and found.compare_evidence(plain) > 0.0:
-                return found
+    with contextlib.suppress(*BREAKDOWN):  # with stamps that are farther off than before
+        found = _move_until_near(move, plain)
+        if found is not None and found is not plain and found.compare_evidence(plain) > 0.0:
+            return found
     return plain
 
 
@@ -169,6 +182,10 @@ def _move_until_near(move: _Move, found: _Candidate) -> _Candidate | None:
             return found
         found = move(ahead, found.begun)
     return found if _estimate_offsets(found) == found.offsets else None
+
+
+def _is_far(offsets: StampOffsets) -> bool:
+    return max(abs(offsets.positions), abs(offsets.velocities)) > LINEAR_OFFSET
 
 
 def _accept_all(problem: Problem, points: Points) -> bool:
@@ -185,7 +202,7 @@ def _guess_offsets(clock: ClockOffsets) -> StampOffsets | None:
     between = 0.0 if clock.apart is None or clock.between is None else clock.between.lag
     odometer = velocities if clock.of_imu else 0.0
     guess = _join(StampOffsets(velocities + between, velocities, odometer))
-    return guess if max(abs(guess.positions), abs(guess.velocities)) > LINEAR_OFFSET else None
+    return guess if _is_far(guess) else None
 
 
 def _join(offsets: StampOffsets) -> StampOffsets:
@@ -194,9 +211,10 @@ def _join(offsets: StampOffsets) -> StampOffsets:
     return replace(offsets, velocities=offsets.positions) if near else offsets
 
 
-def _estimate_offsets(candidate: _Candidate) -> StampOffsets:
-    """The offsets estimated, those that are far and significant; the others as they are."""
-    at, known = candidate.offsets, (candidate.prepared or candidate.begun).estimate_parameters()
+def _estimate_offsets(candidate: _Candidate, far: float = LINEAR_OFFSET) -> StampOffsets:
+    """The offsets estimated, those that are significant and as far, s; the others as they are."""
+    at, one = candidate.offsets, candidate.prepared
+    known = candidate.begun.estimate_parameters(far) if one is None else one.estimate_parameters()
     if known is None:
         return at
     problem, values, P = known
@@ -205,7 +223,7 @@ def _estimate_offsets(candidate: _Candidate) -> StampOffsets:
         if name in ends:
             rows = ends[name]
             sigma = np.sqrt(np.einsum("ij,jk,ik->i", rows, P, rows))
-            if (np.abs(rows @ values) > np.maximum(LINEAR_OFFSET, _SIGNIFICANT * sigma)).any():
+            if (np.abs(rows @ values) > np.maximum(far, _SIGNIFICANT * sigma)).any():
                 new[key] = getattr(at, key) + float(rows[0] @ values)
     if not new:
         return at

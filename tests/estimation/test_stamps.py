@@ -17,6 +17,7 @@ from graphnav.constraints.antenna_motion import LEVER_ARM, LINEAR_OFFSET
 from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
+from graphnav.estimation import stamps
 from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.noise.model import StampOffsets
 from graphnav.estimation.offsets import move_stamps
@@ -149,6 +150,14 @@ def test_right_stamps_are_left() -> None:
     assert solved("as it is").noise.stamps == StampOffsets()
     stated = run(late("both"), solvers=("ekf",), noise="stated")["ekf"]
     assert stated.noise.stamps == StampOffsets()
+
+
+@pytest.mark.parametrize("guess", [-0.6, 1.5])
+def test_a_wrong_guess_changes_nothing(guess: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stamps, "_guess_offsets", lambda clock: StampOffsets(guess, guess))
+    settings = parse_settings({"gnss": {"clock_rate_sigma": 0.0}})
+    found = run(late("as it is"), settings, solvers=("rts",))["rts"]
+    assert (found.states.p == solved("as it is").states.p).all()
 
 
 def test_what_is_said_of_fixes_is_on_their_own_clock() -> None:
