@@ -15,6 +15,8 @@ from graphnav.recording import Recording, take_rows
 _HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about the vehicle's up axis
 _BLIND, _SPARSE = 20.0, 8.0  # s
 _AVERAGED = 5  # rows of the IMU
+_LATE, _JITTER = 0.3, 0.05  # s
+_GYRO_NOISE, _ACCEL_NOISE = 2e-3, 0.03  # rad/s and m/s^2, of each row
 
 
 def turn_back(recording: Recording) -> Recording:
@@ -96,6 +98,21 @@ def average_imu(recording: Recording) -> Recording:
     return replace(recording, imu=replace(imu, t=t[whole, -1], gyro=gyro[whole], accel=accel[whole]))
 
 
+def log_as_phone(recording: Recording) -> Recording:
+    """The drive as a phone logs it: fixes stamped late, each otherwise, one a second, without velocities, and with one
+    sigma for all, twice as large in height; beside an IMU with more noise.
+    """
+    imu, gnss, rng = recording.imu, recording.gnss, np.random.default_rng(5)
+    assert gnss is not None
+    t = gnss.t + _LATE + rng.uniform(0.0, _JITTER, len(gnss.t))
+    sd = np.tile(np.median(gnss.sd[:, 0]) * np.array([1.0, 1.0, 2.0]), (len(t), 1))
+    first = np.unique(np.floor(t - t[0]), return_index=True)[1]
+    fixes = take_rows(replace(gnss, t=t, sd=sd, v=None, sd_v=None), np.isin(np.arange(len(t)), first))
+    gyro = imu.gyro + rng.normal(0.0, _GYRO_NOISE, imu.gyro.shape)
+    accel = imu.accel + rng.normal(0.0, _ACCEL_NOISE, imu.accel.shape)
+    return replace(recording, gnss=fixes, imu=replace(imu, gyro=gyro, accel=accel))
+
+
 def _reverse(rows: Array | None) -> Array | None:
     return None if rows is None else rows[::-1]
 
@@ -110,4 +127,5 @@ CHANGES: dict[str, Callable[[Recording], Recording]] = {
     "blind-start": withhold_start,
     "sparse-fixes": thin_fixes,
     "slow-imu": average_imu,
+    "phone": log_as_phone,
 }

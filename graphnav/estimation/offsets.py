@@ -22,10 +22,10 @@ from graphnav.recording import Recording
 AS_STATED = StampOffsets()
 
 
-def is_offset_far(problem: Problem, points: Points) -> bool:
-    """Whether an offset is far from the linearisation point of its rows, by points of all keyframes."""
+def is_offset_far(problem: Problem, points: Points, far: float = LINEAR_OFFSET) -> bool:
+    """Whether an offset is as far (s) from the linearisation point of its rows, by points of all keyframes."""
     ends = list_end_rows(problem).values()
-    return any(float(np.abs(row @ points.values[0]).max()) > LINEAR_OFFSET for row in ends)
+    return any(float(np.abs(row @ points.values[0]).max()) > far for row in ends)
 
 
 def list_end_rows(problem: Problem) -> dict[str, Array]:

@@ -154,13 +154,13 @@ class Begun:
         self.passes.update(filter=1)
         return self.found.estimate.log_evidence - weigh_rest(self.found.base, self.found.estimate, some)
 
-    def estimate_parameters(self) -> tuple[Problem, Array, Array] | None:
-        """The problem, its parameters (D-15,) at the end and their covariance; None where no stamp is far off."""
+    def estimate_parameters(self, far: float) -> tuple[Problem, Array, Array] | None:
+        """The problem, its parameters (D-15,) at the end and their covariance; None where no stamp is as far off, s."""
         if self.found is None:
             return None
         best = self.found.estimate
         problem = apply_noise(self.found.base, best.noise)
-        if not is_offset_far(problem, best.points):
+        if not is_offset_far(problem, best.points, far):
             return None
         self.passes.update(filter=1)
         forward = refilter(problem, best.points, whole=False)

@@ -4,10 +4,10 @@ A fix whose stamp is off by d is predicted from the state at the stamp, with an 
 within `LINEAR_OFFSET` of it (`graphnav.constraints.gnss`). Farther away a vehicle's acceleration changes otherwise. So
 where an offset is estimated farther than that from where the rows are linearised, the stamps are moved to the estimate,
 that of the clocks' rate with it, and all is estimated again from there, a step of Gauss-Newton, until the estimate
-stays within. Where the clocks of IMU and fixes disagree for certain (`graphnav.recording.checks.clock`), the first step
-is what they disagree by. The stamps as they are remain a candidate: the likelier stands. Stamps are moved before wrong
-measurements are searched for, as late fixes look wrong in every bend, and once more where the search has changed the
-noise model.
+stays within, and the likelier stands. Where the clocks of IMU and fixes disagree for certain
+(`graphnav.recording.checks.clock`), all is begun about what they disagree by, and moved to what is estimated there; the
+stated stamps are tried only where that is near them. Stamps are moved before wrong measurements are searched for,
+as late fixes look wrong in every bend, and once more where the search has changed the noise model.
 
 A solution is on the clock of the IMU, and what it says of fixes is on theirs (`shift_to_own_clocks`).
 """
@@ -24,7 +24,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LINEAR_OFFSET
-from graphnav.constraints.base import SAME_TIME, Constraint
+from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
 from graphnav.constraints.odometer import ODOMETER_DELAY
 from graphnav.core.interpolation import pick_nearest
@@ -73,35 +73,33 @@ class _Candidate:
         return self.begun.all_passes if self.prepared is None else self.prepared.passes
 
     def compare_evidence(self, other: _Candidate) -> float:
-        """The logarithm of the evidence less that of another, both of as many measurements: with its stamps moved a fix
-        may leave the span of the IMU, and a keyframe with what is assumed there goes with it.
+        """The logarithm of the evidence of the fixes by all other measurements, less that of another candidate, both of
+        the same fixes: with its stamps moved one may leave the span of the IMU. Other rows are at keyframes and, with
+        these elsewhere, of another evidence: those of stops by tens of nats, whatever the stamps.
         """
-        return self._weigh_common(other) - other._weigh_common(self)
+        return self._weigh_fixes(other) - other._weigh_fixes(self)
 
-    def _weigh_common(self, other: _Candidate) -> float:
-        one, their = self.begun.found, other.begun.found
-        assert one is not None
-        assert their is not None
-        theirs = {rows.name: other._list_stamps(their.base, rows) for rows in their.base.constraints}
-        beyond: dict[str, tuple[Span, ...]] = {}
-        for rows in one.base.constraints:
-            t, same = self._list_stamps(one.base, rows), theirs.get(rows.name, np.empty(0))
-            if rows.name in _OWN_STAMPS:
-                apart = np.abs(same[pick_nearest(same, t)] - t) if len(same) else np.full(len(t), np.inf)
-                lacking = apart > 10.0 * SAME_TIME  # both rounded
-            else:  # at keyframes, of which any are alike
-                kept = np.linspace(0.0, len(t) - 1.0, min(len(same), len(t))).round().astype(int)
-                lacking = ~np.isin(np.arange(len(t)), kept)
-            if lacking.any():
-                beyond[rows.name] = tuple((x, x) for x in one.base.t[rows.keyframe][lacking].tolist())
-        return self.log_evidence - self.begun.weigh_measurements(beyond) if beyond else self.log_evidence
+    def _weigh_fixes(self, other: _Candidate) -> float:
+        assert self.begun.found is not None
+        theirs, beyond = other._list_stamps(), dict[str, tuple[Span, ...]]()
+        for name, (own, t) in self._list_stamps().items():
+            same = theirs[name][0] if name in theirs else np.empty(0)
+            apart = np.abs(same[pick_nearest(same, own)] - own) if len(same) else np.full(len(own), np.inf)
+            if (lacking := t[apart > 10.0 * SAME_TIME]).size:  # both rounded
+                beyond[name] = tuple((x, x) for x in lacking.tolist())
+        gained = self.log_evidence - self.begun.found.estimate.log_evidence  # by what is free or left out
+        of_fixes = self.begun.weigh_measurements(dict.fromkeys(_OWN_STAMPS, ((-np.inf, np.inf),)))
+        return gained + of_fixes - (self.begun.weigh_measurements(beyond) if beyond else 0.0)
 
-    def _list_stamps(self, problem: Problem, rows: Constraint) -> Array:
-        """(N,) s, on their own clock, of fixes; of other rows the times of their keyframes."""
-        t, by = problem.t[rows.keyframe], _list_by_constraint(self.offsets)
-        if rows.name not in by:
-            return t
-        return np.asarray(shift_stamps_back(t, by[rows.name], self.offsets.rate, self.offsets.since))
+    def _list_stamps(self) -> dict[str, tuple[Array, Array]]:
+        """(N,) s, stamps of fixes by constraint, on their own clock and that of the IMU."""
+        assert self.begun.found is not None
+        base, stamps, out = self.begun.found.base, self.offsets, dict[str, tuple[Array, Array]]()
+        for rows in base.constraints:
+            if (late := _list_by_constraint(stamps).get(rows.name)) is not None:
+                t = base.t[rows.keyframe]
+                out[rows.name] = np.asarray(shift_stamps_back(t, late, stamps.rate, stamps.since)), t
+        return out
 
 
 # stamp offsets, and what was begun with others, if anything -> the recording with its stamps moved by these
@@ -137,14 +135,15 @@ def find_stamps(
     def solve_moved(offsets: StampOffsets, before: Begun | None) -> _Candidate:
         return solve(begin_moved(offsets, before), _accept_all)
 
-    as_stated = begin_moved(AS_STATED, None)
-    early = _find(begin_moved, as_stated, None if clock is None else _guess_offsets(clock))
+    early = None if clock is None else _begin_about(begin_moved, _guess_offsets(clock))
+    if early is None:
+        early = _find(begin_moved, begin_moved(AS_STATED, None))
     try:
         found = solve(early, is_offset_far)
     except BREAKDOWN:
-        if early is as_stated:
+        if early.offsets == AS_STATED:
             raise
-        found = solve(as_stated, is_offset_far)
+        found = solve(begin_moved(AS_STATED, None), is_offset_far)
     # wrong measurements may have hidden an offset, or been taken for one
     if found.log_evidence > found.begun.log_evidence + found.begun.gained_by_chance:
         found = _find(solve_moved, found)
@@ -153,14 +152,26 @@ def find_stamps(
     return move_stamps(recording, found.offsets), prepared, found.offsets
 
 
-def _find(move: _Move, plain: _Candidate, guess: StampOffsets | None = None) -> _Candidate:
+def _begin_about(move: _Move, guess: StampOffsets | None) -> _Candidate | None:
+    """What is begun with stamps moved to where their offsets are estimated from a guess; None where these are near what
+    is stated, or do not come about.
+    """
+    if guess is None:
+        return None
+    with contextlib.suppress(*BREAKDOWN):
+        start = move(guess, None)
+        ahead = _estimate_offsets(start, 0.0)  # what is left has the prior of a receiver's, not that of a guess
+        found = _move_until_near(move, start if ahead == guess else move(ahead, start.begun))
+        return found if found is not None and _is_far(found.offsets) else None
+    return None
+
+
+def _find(move: _Move, plain: _Candidate) -> _Candidate:
     """What is likeliest, with its stamps as they are or moved until their offsets are estimated near where they are."""
-    for first in (plain,) if guess is None else (guess, plain):
-        with contextlib.suppress(*BREAKDOWN):  # with stamps that are farther off than before
-            start = move(first, None) if isinstance(first, StampOffsets) else first
-            found = _move_until_near(move, start)
-            if found is not None and found is not plain and found.compare_evidence(plain) > 0.0:
-                return found
+    with contextlib.suppress(*BREAKDOWN):  # with stamps that are farther off than before
+        found = _move_until_near(move, plain)
+        if found is not None and found is not plain and found.compare_evidence(plain) > 0.0:
+            return found
     return plain
 
 
@@ -171,6 +182,10 @@ def _move_until_near(move: _Move, found: _Candidate) -> _Candidate | None:
             return found
         found = move(ahead, found.begun)
     return found if _estimate_offsets(found) == found.offsets else None
+
+
+def _is_far(offsets: StampOffsets) -> bool:
+    return max(abs(offsets.positions), abs(offsets.velocities)) > LINEAR_OFFSET
 
 
 def _accept_all(problem: Problem, points: Points) -> bool:
@@ -187,7 +202,7 @@ def _guess_offsets(clock: ClockOffsets) -> StampOffsets | None:
     between = 0.0 if clock.apart is None or clock.between is None else clock.between.lag
     odometer = velocities if clock.of_imu else 0.0
     guess = _join(StampOffsets(velocities + between, velocities, odometer))
-    return guess if max(abs(guess.positions), abs(guess.velocities)) > LINEAR_OFFSET else None
+    return guess if _is_far(guess) else None
 
 
 def _join(offsets: StampOffsets) -> StampOffsets:
@@ -196,9 +211,10 @@ def _join(offsets: StampOffsets) -> StampOffsets:
     return replace(offsets, velocities=offsets.positions) if near else offsets
 
 
-def _estimate_offsets(candidate: _Candidate) -> StampOffsets:
-    """The offsets estimated, those that are far and significant; the others as they are."""
-    at, known = candidate.offsets, (candidate.prepared or candidate.begun).estimate_parameters()
+def _estimate_offsets(candidate: _Candidate, far: float = LINEAR_OFFSET) -> StampOffsets:
+    """The offsets estimated, those that are significant and as far, s; the others as they are."""
+    at, one = candidate.offsets, candidate.prepared
+    known = candidate.begun.estimate_parameters(far) if one is None else one.estimate_parameters()
     if known is None:
         return at
     problem, values, P = known
@@ -207,7 +223,7 @@ def _estimate_offsets(candidate: _Candidate) -> StampOffsets:
         if name in ends:
             rows = ends[name]
             sigma = np.sqrt(np.einsum("ij,jk,ik->i", rows, P, rows))
-            if (np.abs(rows @ values) > np.maximum(LINEAR_OFFSET, _SIGNIFICANT * sigma)).any():
+            if (np.abs(rows @ values) > np.maximum(far, _SIGNIFICANT * sigma)).any():
                 new[key] = getattr(at, key) + float(rows[0] @ values)
     if not new:
         return at

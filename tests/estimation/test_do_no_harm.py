@@ -373,3 +373,14 @@ def test_fewer_fixes_and_a_slower_imu(changes, drive):
     assert slow.period == pytest.approx(5.0 * drive.imu.period)
     np.testing.assert_allclose(slow.gyro[7], drive.imu.gyro[35:40].mean(axis=0))
     assert slow.t[7] == drive.imu.t[39]
+
+
+def test_a_phone_stamps_fixes_late(changes, tokyo):
+    logged = changes["phone"](tokyo)
+    same = np.abs(logged.gnss.t[:, None] - 0.325 - tokyo.gnss.t).argmin(axis=1)
+    np.testing.assert_array_equal(logged.gnss.llh, tokyo.gnss.llh[same])
+    late = logged.gnss.t - tokyo.gnss.t[same]
+    assert 0.3 <= late.min() < late.max() <= 0.35
+    assert np.diff(logged.gnss.t).mean() == pytest.approx(1.0, abs=0.01)
+    assert len(np.unique(logged.gnss.sd, axis=0)) == 1
+    assert np.std(logged.imu.gyro - tokyo.imu.gyro) == pytest.approx(2e-3, rel=0.05)

@@ -13,16 +13,17 @@ import pytest
 from graphnav import load, run
 from graphnav.app.workflow import GivenNoise, Request, run_request
 from graphnav.config import parse_settings
-from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.constraints.antenna_motion import LEVER_ARM, LINEAR_OFFSET
 from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
+from graphnav.estimation import stamps
 from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.noise.model import StampOffsets
 from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.stamps import shift_to_imu_clock, shift_to_own_clocks
-from graphnav.recording import Gnss, Recording
+from graphnav.recording import Gnss, Recording, take_rows
 
 TOKYO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
 LATE = 3.0  # s, as a receiver whose fixes are stamped that much later
@@ -122,10 +123,41 @@ def test_an_offset_is_no_smaller_for_vibration(shared_data: Path) -> None:
         assert abs(off) < 4.0 * found[name].sigma[0, 0], name
 
 
+def test_stops_do_not_say_how_late_fixes_are(shared_data: Path) -> None:
+    """Rows of stops are at keyframes, and these elsewhere with other stamps: their evidence is not that of stamps."""
+    recording, rng, by = (
+        load(shared_data / "oracle_drive").crop(37.0, 337.0).without("odometer"),
+        np.random.default_rng(5),
+        0.4,
+    )
+    gnss, imu = recording.gnss, recording.imu
+    assert gnss is not None
+    fixes = np.isin(np.arange(len(gnss.t)), np.unique(np.floor(gnss.t), return_index=True)[1])
+    jitter = rng.uniform(-0.025, 0.025, len(gnss.t))
+    later = take_rows(replace(gnss, t=gnss.t + by + jitter, v=None, sd_v=None), fixes)
+    noisy = replace(
+        imu,
+        gyro=imu.gyro + rng.normal(0.0, 2e-3, imu.gyro.shape),
+        accel=imu.accel + rng.normal(0.0, 0.03, imu.accel.shape),
+    )
+    found = run(replace(recording, gnss=later, imu=noisy), solvers=("ekf",))["ekf"]
+    assert abs(found.noise.stamps.positions + by) < LINEAR_OFFSET
+    offset = found.parameters["gnss_time_offset"]
+    assert abs(offset.value[-1, 0] + by) < 4.0 * offset.sigma[-1, 0]
+
+
 def test_right_stamps_are_left() -> None:
     assert solved("as it is").noise.stamps == StampOffsets()
     stated = run(late("both"), solvers=("ekf",), noise="stated")["ekf"]
     assert stated.noise.stamps == StampOffsets()
+
+
+@pytest.mark.parametrize("guess", [-0.6, 1.5])
+def test_a_wrong_guess_changes_nothing(guess: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stamps, "_guess_offsets", lambda clock: StampOffsets(guess, guess))
+    settings = parse_settings({"gnss": {"clock_rate_sigma": 0.0}})
+    found = run(late("as it is"), settings, solvers=("rts",))["rts"]
+    assert (found.states.p == solved("as it is").states.p).all()
 
 
 def test_what_is_said_of_fixes_is_on_their_own_clock() -> None:
