@@ -40,6 +40,7 @@ from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Begun, Prepared, begin_preparation, prepare
 from graphnav.estimation.relinearisation import CLEARLY_BETTER, step_ahead
+from graphnav.estimation.remounting import describe_remountings, find_remountings, undo_remountings
 from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
@@ -258,18 +259,26 @@ def _solve(
     def finish(begun: Begun, weigh: Weigh) -> Prepared:
         return prepare(begun, progress, weigh)
 
+    if noise is None:
+        remountings, plain = find_remountings(recording, partial(begin_moved, rate=0.0), begin_moved(recording, 0.0))
+        recording = undo_remountings(recording, remountings)
+    else:
+        remountings = noise.remountings
+        recording = undo_remountings(recording, remountings)
     if noise is None and may_move(recording, settings):
-        recording, found, stamps = find_stamps(recording, begin_moved, finish, clock)
+        recording, found, stamps = find_stamps(recording, plain, begin_moved, finish, clock)
     else:
         stamps = StampOffsets() if noise is None else noise.stamps
         recording = move_stamps(recording, stamps)
-        found = prepare(begin_moved(recording, stamps.rate), progress)
+        found = prepare(plain if noise is None else begin_moved(recording, stamps.rate), progress)
+    found = replace(found, noise=replace(found.noise, remountings=remountings))
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
     faults = find_fault_spans(problem, smoothed, found.noise.excluded)
     notes = (
         *found.start.notes,
         *undone,
         *shown,
+        *describe_remountings(remountings, recording),
         *found.detections.notes,
         *describe_stamps(stamps, found.noise.freed),
         *found.notes,

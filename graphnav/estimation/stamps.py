@@ -31,6 +31,7 @@ from graphnav.core.interpolation import pick_nearest
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import shift_stamps, shift_stamps_back
+from graphnav.detectors.base import NONE, mask_inside, merge_spans, subtract_spans
 from graphnav.estimation.contradictions import Freed
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
@@ -72,13 +73,15 @@ class _Candidate:
     def passes(self) -> Counter[str]:
         return self.begun.all_passes if self.prepared is None else self.prepared.passes
 
-    def compare_evidence(self, other: _Candidate) -> float:
+    def compare_evidence(self, other: _Candidate, apart: Array = NONE) -> float:
         """The logarithm of the evidence less that of another, both of as many measurements: with its stamps moved a fix
         may leave the span of the IMU, and a keyframe with what is assumed there goes with it.
-        """
-        return self._weigh_common(other) - other._weigh_common(self)
 
-    def _weigh_common(self, other: _Candidate) -> float:
+        What is assumed within the spans `apart` (n, 2), s, counts for neither.
+        """
+        return self._weigh_common(other, apart) - other._weigh_common(self, apart)
+
+    def _weigh_common(self, other: _Candidate, apart: Array) -> float:
         one, their = self.begun.found, other.begun.found
         assert one is not None
         assert their is not None
@@ -87,10 +90,12 @@ class _Candidate:
         for rows in one.base.constraints:
             t, same = self._list_stamps(one.base, rows), theirs.get(rows.name, np.empty(0))
             if rows.name in _OWN_STAMPS:
-                apart = np.abs(same[pick_nearest(same, t)] - t) if len(same) else np.full(len(t), np.inf)
-                lacking = apart > 10.0 * SAME_TIME  # both rounded
+                off = np.abs(same[pick_nearest(same, t)] - t) if len(same) else np.full(len(t), np.inf)
+                lacking = off > 10.0 * SAME_TIME  # both rounded
             else:  # at keyframes, of which any are alike
-                kept = np.linspace(0.0, len(t) - 1.0, min(len(same), len(t))).round().astype(int)
+                ours = np.flatnonzero(~mask_inside(t, apart))
+                fewer = min(int(np.count_nonzero(~mask_inside(same, apart))), len(ours))
+                kept = ours[np.linspace(0.0, len(ours) - 1.0, fewer).round().astype(int)]
                 lacking = ~np.isin(np.arange(len(t)), kept)
             if lacking.any():
                 beyond[rows.name] = tuple((x, x) for x in one.base.t[rows.keyframe][lacking].tolist())
@@ -102,6 +107,15 @@ class _Candidate:
         if rows.name not in by:
             return t
         return np.asarray(shift_stamps_back(t, by[rows.name], self.offsets.rate, self.offsets.since))
+
+
+def compare_evidence(one: Begun, other: Begun) -> float:
+    """The logarithm of the evidence less that of another, both of the measurements that they have in common, without
+    what is assumed where only one of them stands.
+    """
+    stops, others = one.built.detections.stationary, other.built.detections.stationary
+    apart = np.concatenate([subtract_spans(stops, others), subtract_spans(others, stops)])
+    return _Candidate(AS_STATED, one).compare_evidence(_Candidate(AS_STATED, other), merge_spans(apart))
 
 
 # stamp offsets, and what was begun with others, if anything -> the recording with its stamps moved by these
@@ -116,12 +130,13 @@ def may_move(recording: Recording, settings: Settings) -> bool:
 
 
 def find_stamps(
-    recording: Recording, begin: Begin, finish: Finish, clock: ClockOffsets | None
+    recording: Recording, plain: Begun, begin: Begin, finish: Finish, clock: ClockOffsets | None
 ) -> tuple[Recording, Prepared, StampOffsets]:
     """The recording with its stamps where their offsets are estimated, and what its solvers share.
 
     Parameters
     ----------
+    plain : begun with the stamps as they are.
     clock : offsets between IMU and fixes that the recording shows before any estimation.
     """
     tried: dict[int, _Candidate] = {}
@@ -137,7 +152,7 @@ def find_stamps(
     def solve_moved(offsets: StampOffsets, before: Begun | None) -> _Candidate:
         return solve(begin_moved(offsets, before), _accept_all)
 
-    as_stated = begin_moved(AS_STATED, None)
+    as_stated = tried[id(plain)] = _Candidate(AS_STATED, plain)
     early = _find(begin_moved, as_stated, None if clock is None else _guess_offsets(clock))
     try:
         found = solve(early, is_offset_far)
