@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import graphnav
+from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.recording import Recording, take_rows
 
@@ -17,6 +18,7 @@ _BLIND, _SPARSE = 20.0, 8.0  # s
 _AVERAGED = 5  # rows of the IMU
 _LATE, _JITTER = 0.3, 0.05  # s
 _GYRO_NOISE, _ACCEL_NOISE = 2e-3, 0.03  # rad/s and m/s^2, of each row
+_TURN, _LASTS = np.radians([0.0, 0.0, 30.0]), 2.0  # and s
 
 
 def turn_back(recording: Recording) -> Recording:
@@ -113,6 +115,18 @@ def log_as_phone(recording: Recording) -> Recording:
     return replace(recording, gnss=fixes, imu=replace(imu, gyro=gyro, accel=accel))
 
 
+def turn_device(recording: Recording) -> Recording:
+    """The drive with an IMU that is turned in its holder halfway, and keeps its biases (of a solution)."""
+    imu = recording.imu
+    solved = graphnav.run(recording, None, ("rts",), noise="stated")["rts"]
+    bg, ba = (np.median(getattr(solved.states, name), axis=0) for name in ("bg", "ba"))
+    share = np.clip((imu.t - 0.5 * (recording.start + recording.end)) / _LASTS, 0.0, 1.0)
+    R = np.swapaxes(rotation.exp(share[:, None] * _TURN), -1, -2)
+    own = np.diff(share, prepend=0.0) / np.diff(imu.t, prepend=recording.start)
+    gyro, accel = ((R @ x[..., None])[..., 0] for x in (imu.gyro - bg, imu.accel - ba))
+    return replace(recording, imu=replace(imu, gyro=gyro + bg + own[:, None] * _TURN, accel=accel + ba))
+
+
 def _reverse(rows: Array | None) -> Array | None:
     return None if rows is None else rows[::-1]
 
@@ -128,4 +142,5 @@ CHANGES: dict[str, Callable[[Recording], Recording]] = {
     "sparse-fixes": thin_fixes,
     "slow-imu": average_imu,
     "phone": log_as_phone,
+    "turned-imu": turn_device,
 }

@@ -213,7 +213,9 @@ def crop_solution(solution: Solution, share: Share, detections: tuple[Detection,
         excluded = {name: crop_spans(spans) for name, spans in model.excluded.items()}
         used = {name: crop_spans(spans) for name, spans in model.span_weights.items()}
         stops = crop_spans(model.false_stops)
-        return replace(model, weights=weights, excluded=excluded, span_weights=used, false_stops=stops)
+        turned = tuple(one for one in model.remountings if start <= one.end < end)
+        changed = replace(model, weights=weights, excluded=excluded, span_weights=used, false_stops=stops)
+        return replace(changed, remountings=turned)
 
     def crop_arcs(arcs: CarrierArcs) -> CarrierArcs:
         some = (arcs.begin < end) & (arcs.end >= start)

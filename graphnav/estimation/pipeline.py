@@ -40,6 +40,7 @@ from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Begun, Prepared, begin_preparation, prepare
 from graphnav.estimation.relinearisation import CLEARLY_BETTER, step_ahead
+from graphnav.estimation.remounting import describe_remountings, find_remountings, undo_remountings
 from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
@@ -258,18 +259,29 @@ def _solve(
     def finish(begun: Begun, weigh: Weigh) -> Prepared:
         return prepare(begun, progress, weigh)
 
-    if noise is None and may_move(recording, settings):
-        recording, found, stamps = find_stamps(recording, begin_moved, finish, clock)
-    else:
+    def find(recording: Recording) -> tuple[Recording, Begun, Prepared, StampOffsets]:
+        if noise is None and may_move(recording, settings):
+            return find_stamps(recording, begin_moved, finish, clock)
         stamps = StampOffsets() if noise is None else noise.stamps
         recording = move_stamps(recording, stamps)
-        found = prepare(begin_moved(recording, stamps.rate), progress)
+        begun = begin_moved(recording, stamps.rate)
+        return recording, begun, prepare(begun, progress), stamps
+
+    remountings = () if noise is None else noise.remountings
+    given = undo_remountings(recording, remountings)
+    recording, begun, found, stamps = find(given)
+    if noise is None:
+        remountings = find_remountings(recording, partial(begin_moved, rate=stamps.rate), begun)
+        if remountings:
+            recording, begun, found, stamps = find(undo_remountings(given, remountings))
+    found = replace(found, noise=replace(found.noise, remountings=remountings))
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
     faults = find_fault_spans(problem, smoothed, found.noise.excluded)
     notes = (
         *found.start.notes,
         *undone,
         *shown,
+        *describe_remountings(remountings, recording),
         *found.detections.notes,
         *describe_stamps(stamps, found.noise.freed),
         *found.notes,

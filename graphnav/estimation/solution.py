@@ -380,6 +380,7 @@ def _join_noise(parts: list[NoiseModel]) -> NoiseModel:
             for one in part.rivals
         ),
         false_stops=tuple(span for part in parts for span in part.false_stops),
+        remountings=tuple(one for part in parts for one in part.remountings),
     )
 
 

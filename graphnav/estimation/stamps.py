@@ -115,8 +115,9 @@ def may_move(recording: Recording, settings: Settings) -> bool:
 
 def find_stamps(
     recording: Recording, begin: Begin, finish: Finish, clock: ClockOffsets | None
-) -> tuple[Recording, Prepared, StampOffsets]:
-    """The recording with its stamps where their offsets are estimated, and what its solvers share.
+) -> tuple[Recording, Begun, Prepared, StampOffsets]:
+    """The recording with its stamps where their offsets are estimated, what was begun with it, and what its solvers
+    share.
 
     Parameters
     ----------
@@ -149,7 +150,7 @@ def find_stamps(
         found = _find(solve_moved, found)
     assert found.prepared is not None
     prepared = replace(found.prepared, passes=sum((one.passes for one in tried.values()), Counter()))
-    return move_stamps(recording, found.offsets), prepared, found.offsets
+    return move_stamps(recording, found.offsets), found.begun, prepared, found.offsets
 
 
 def _begin_about(move: _Move, guess: StampOffsets | None) -> _Candidate | None:

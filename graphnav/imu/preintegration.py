@@ -332,6 +332,10 @@ def _integrate(
         Q += compute_directed_covariance(along_gyro, along_accel, R, left, a_edge, b_edge)
 
     dR, v_ba, v_bg, p_ba, p_bg = (take_last(x) for x in (R, A, B, PA, PB))
+    for when in imu.remounted:  # its biases begin anew
+        anew = np.flatnonzero((t[rows] < when) & (when <= t[rows + 1]))
+        for at, sigma in ((slice(9, 12), imu.noise.accel_bias_sigma), (slice(12, 15), imu.noise.gyro_bias_sigma)):
+            Q[anew, at, at] += sigma**2 * np.eye(3)
     turn = np.zeros((n, 15, 15))  # theta from the start frame to a right perturbation of dR
     turn[:, 3:, 3:] = np.eye(12)
     turn[:, :3, :3] = np.swapaxes(dR, -1, -2)

@@ -47,6 +47,7 @@ class Imu:
     noise: ImuNoise = ImuNoise()
     R_bs: Array = field(default_factory=lambda: np.eye(3))  # body (RFU) from the file's axes
     noise_assumed: bool = False  # True when the recording states no noise figures
+    remounted: tuple[float, ...] = ()  # s, when it was turned in its holder, which is undone but for its biases
 
     @property
     def period(self) -> float:

@@ -23,8 +23,17 @@ from graphnav.core.errors import ConfigError
 from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
-from graphnav.estimation.noise.files import list_groups, list_noise, read_noise, read_noise_and_mode, write_noise
-from graphnav.estimation.noise.model import STATED, FreedConstant, NoiseModel, Rival, RowWeights, VarianceComponent
+from graphnav.estimation.noise.files import list_noise, read_noise, read_noise_and_mode, write_noise
+from graphnav.estimation.noise.groups import list_groups
+from graphnav.estimation.noise.model import (
+    STATED,
+    FreedConstant,
+    NoiseModel,
+    Remounting,
+    Rival,
+    RowWeights,
+    VarianceComponent,
+)
 from graphnav.estimation.noise.table import compute_whole_ratio, tabulate_figures
 from graphnav.estimation.problem import build_problem
 from graphnav.recording.formats import read as load
@@ -42,6 +51,7 @@ def some_noise(seed: int = 0) -> NoiseModel:
         {"gnss_error_of_seconds": float(rng.uniform(0.2, 60.0)), "nhc_error": 1.0 / 3.0},
         {"gnss_position": RowWeights(t, rng.uniform(0.0, 1.0, 50))},
         {"gnss_position": ((t[3], t[7]), (t[9], t[9])), "nhc": ((t[1], t[2]),)},
+        remountings=(Remounting(t[4], t[5], tuple(rng.normal(size=3).tolist()), float(rng.uniform(0.01, 0.1))),),
         rivals=(Rival(float(rng.uniform()), {"gnss_position": ((t[8], t[9]),)}),),
         freed={
             LEVER_ARM: FreedConstant(tuple(rng.normal(size=3).tolist()), tuple(rng.uniform(0.001, 0.1, 3).tolist())),
@@ -56,7 +66,7 @@ def test_a_noise_model_comes_back_to_the_last_digit(tmp_path: Path) -> None:
     again, mode = read_noise_and_mode(write_noise(tmp_path / "noise.json", noise, "stated"))
     assert mode == "stated"
     assert (again.figures, again.times, again.excluded) == (noise.figures, noise.times, noise.excluded)
-    assert (again.freed, again.rivals) == (noise.freed, noise.rivals)
+    assert (again.freed, again.rivals, again.remountings) == (noise.freed, noise.rivals, noise.remountings)
     assert again.weights.keys() == noise.weights.keys()
     for name, some in noise.weights.items():
         np.testing.assert_array_equal(again.weights[name].t, some.t)
@@ -103,6 +113,7 @@ BAD = {
         ("imu.gyro_noise'", "'imu.gyro_noise_density'"),
     ),
     "unknown key of a figure": (changed(f"{FIGURE}/sigmas", 1.0), "key.unknown", ("sigmas'", "'sigma'")),
+    "no remounting": (changed("noise/remountings", [[1.0, 2.0, 0.5]]), "key.value", ("'noise.remountings'",)),
     "no flag": (changed("noise/searched", 1), "key.value", ("'noise.searched'", "= 1")),
     "no figure": (changed(FIGURE, {"sigma": 1.0}), "key.missing", ("log_factor",)),
     "a figure is a number": (changed(FIGURE, 2.0), "key.value", ("= 2.0",)),

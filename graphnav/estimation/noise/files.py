@@ -13,6 +13,8 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
     span_weights        by constraint: [begin, end, weight] of those that are used after all, with less information
     false_stops         [begin, end] (s) of spans that are no stops, whatever the detectors say, if there are any
     spacing             s between the fixes that are used, 0 for all
+    remountings         [begin, end] (s) of when the device was turned in its holder, the rotation vector (rad) that
+                        turns what it measured after that back, and its sigma, if it was
     stamps              s, offsets of the stamps of positions, velocities and odometer about which rows are linearised
     lever_arm           m, only where the antenna's is not used as stated: value (right, forward, up) and its sigma
 
@@ -34,37 +36,23 @@ import numpy as np
 
 from graphnav.config.settings import NoiseSettings
 from graphnav.constraints import list_constraints
-from graphnav.constraints.dual_antenna import DualHeading, DualPitch
-from graphnav.constraints.gnss import (
-    CLOCK_RATE,
-    LEVER_ARM,
-    OFFSETS,
-    STAMP_ERROR,
-    STAMPS,
-    TIME_OFFSET,
-    VELOCITY_ERROR,
-    VELOCITY_TIME_OFFSET,
-)
-from graphnav.constraints.lasting import ERRORS, LASTING, MULTIPATH_ERROR
-from graphnav.constraints.odometer import LONGEST_DELAY, ODOMETER_DELAY, ODOMETER_ERROR
-from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
-from graphnav.constraints.vehicle import NHC_ERROR
+from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET
+from graphnav.constraints.odometer import LONGEST_DELAY, ODOMETER_DELAY
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
 from graphnav.core.notes import format_count
+from graphnav.estimation.noise.groups import list_all_processes, list_groups
 from graphnav.estimation.noise.model import (
     INTERVALS,
     FreedConstant,
     NoiseModel,
+    Remounting,
     Rival,
     RowWeights,
     StampOffsets,
     VarianceComponent,
 )
-from graphnav.imu.dynamics import PRIORS
-from graphnav.imu.preintegration import NOISE_FIGURES
-from graphnav.recording import FIX_TYPES
 from graphnav.recording.checks.crosschecks import LARGEST_SHIFT
 
 MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
@@ -84,7 +72,7 @@ _FREED = {
 }
 _KEYS = (
     "mode", "pieces", "figures", "correlation_times", "weights", "tails", "excluded", "rivals", "span_weights",
-    "false_stops", "searched", "spacing", "stamps", *_FREED,
+    "false_stops", "searched", "remountings", "spacing", "stamps", *_FREED,
 )  # fmt: skip
 _LEAST_SIGMA = 1e-9  # of what is the most: nothing is better known
 _FIGURE_KEYS = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
@@ -124,6 +112,11 @@ def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
         **({"false_stops": [[float(a), float(b)] for a, b in noise.false_stops]} if noise.false_stops else {}),
         **({"searched": True} if noise.searched else {}),
         **({"rivals": rivals} if rivals else {}),
+        **(
+            {"remountings": [[x.begin, x.end, *x.rotation, x.sigma] for x in noise.remountings]}
+            if noise.remountings
+            else {}
+        ),
     } | {
         key: {of: list(getattr(noise.freed[name], of)) for of in _PRIOR}
         for key, (name, *_) in _FREED.items()
@@ -200,28 +193,6 @@ def read_noise_and_mode(path: str | Path) -> tuple[NoiseModel, str]:
     return _Reader(path).read_model(values["noise"])
 
 
-def list_groups() -> tuple[str, ...]:
-    """Names of all variance components that a recording can have."""
-    out = [*(f"imu.{name}" for name in NOISE_FIGURES), STAMPS, *OFFSETS, *PRIORS]
-    for cls in list_constraints():
-        axes = dict.fromkeys(cls.noise_axes)
-        kinds = ["", *(f".{kind}" for kind in FIX_TYPES.values())] if cls.name == "gnss_position" else [""]
-        out += [
-            f"{cls.name}{kind}{time}.{axis}"
-            for kind in kinds
-            for time in ("", *(f".{t}" for t in LASTING))
-            for axis in axes
-        ]
-    return tuple(out)
-
-
-def _list_processes() -> tuple[str, ...]:
-    typed = [f"{error}_{kind}" for error in ERRORS for kind in FIX_TYPES.values()]
-    of_antennas = (kind.name_lasting() for kind in (DualHeading, DualPitch))
-    others = VELOCITY_ERROR, *CODE_ERRORS, RATE_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR
-    return (*ERRORS, MULTIPATH_ERROR, *typed, *others, *of_antennas)
-
-
 class _Reader:
     """Plain values checked one by one; complaints name the file and the key."""
 
@@ -236,7 +207,7 @@ class _Reader:
         constraints = [cls.name for cls in list_constraints()]
         return NoiseModel(
             self.read_each(values, "figures", list_groups(), self.read_figure),
-            self.read_each(values, "correlation_times", _list_processes(), self.read_time),
+            self.read_each(values, "correlation_times", list_all_processes(), self.read_time),
             self.read_each(values, "weights", [*constraints, *INTERVALS], self.read_weights),
             self.read_each(values, "excluded", constraints, self.read_spans),
             self.read_each(values, "span_weights", constraints, self.read_weighted_spans),
@@ -247,6 +218,7 @@ class _Reader:
             self.read_spans("noise.false_stops", values.get("false_stops", [])),
             self.read_flag("noise.searched", values.get("searched", False)),
             self.read_rivals("noise.rivals", values.get("rivals", []), constraints),
+            self.read_remountings("noise.remountings", values.get("remountings", [])),
         ), mode
 
     def read_rivals(self, key: str, value: Any, constraints: list[str]) -> tuple[Rival, ...]:
@@ -378,6 +350,10 @@ class _Reader:
 
     def read_spans(self, key: str, value: Any) -> tuple[tuple[float, float], ...]:
         return self._read_spans(key, value, "[begin, end], s", 2)
+
+    def read_remountings(self, key: str, value: Any) -> tuple[Remounting, ...]:
+        found = self._read_spans(key, value, "[begin, end, right, forward, up, sigma], s and rad", 6)
+        return tuple(Remounting(begin, end, tuple(turn), sigma) for begin, end, *turn, sigma in found)
 
     def read_weighted_spans(self, key: str, value: Any) -> tuple[tuple[float, float, float], ...]:
         found = self._read_spans(key, value, "[begin, end, weight], s and of information", 3)

@@ -69,6 +69,16 @@ class FreedConstant:
 
 
 @dataclass(frozen=True)
+class Remounting:
+    """The device was turned in its holder (`graphnav.estimation.remounting`)."""
+
+    begin: float  # s
+    end: float  # s
+    rotation: tuple[float, ...]  # rad, (3,) rotation vector that turns what it measured after that back
+    sigma: float  # rad, 1-sigma about each axis
+
+
+@dataclass(frozen=True)
 class Rival:
     """Spans of fixes that may be wrong instead of those that a noise model excludes."""
 
@@ -94,6 +104,8 @@ class NoiseModel:
     false_stops: tuple[tuple[float, float], ...] = ()  # spans (s) in which the platform moves, whatever detectors say
     searched: bool = False  # whether initial points are searched for, because the filter's lead to a worse optimum
     rivals: tuple[Rival, ...] = ()  # of `excluded`, nearly as likely (`graphnav.estimation.noise.rivals`)
+
+    remountings: tuple[Remounting, ...] = ()  # in the order in which they are undone
 
     def get_factor(self, group: str, missing: float) -> float:
         """The factor on the variance of a group.
