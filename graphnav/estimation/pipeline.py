@@ -274,7 +274,7 @@ def _solve(
         remountings = find_remountings(recording, partial(begin_moved, rate=stamps.rate), begun)
         if remountings:
             recording, begun, found, stamps = find(undo_remountings(given, remountings))
-    found = replace(found, noise=replace(found.noise, remountings=remountings))
+            found = replace(found, noise=replace(found.noise, remountings=remountings))
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
     faults = find_fault_spans(problem, smoothed, found.noise.excluded)
     notes = (

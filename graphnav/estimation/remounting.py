@@ -44,6 +44,7 @@ _OUTSTANDING = 2.0  # how many times larger than any other a change is that is l
 _LEAST = np.deg2rad(3.0)  # as slip in a turn may seem
 _BEGUN, _DONE = 0.2, 0.8  # shares of the turn by which its times are found
 _BEYOND = 0.75  # of the time between these, before and after: the rest, and slow ends
+_SIGMAS = 3.0  # that a turn is larger than
 _LONGEST = 4.0  # s that it takes
 _MOSTLY = 0.5  # of the change, that is to come about within these
 _RATE = 0.5  # s beside it in which the vehicle's turn rate is measured
@@ -95,7 +96,9 @@ def find_remountings(recording: Recording, begin: _Begin, begun: Begun) -> tuple
         for one in _find_changes(begun):
             with contextlib.suppress(*BREAKDOWN):
                 fitted, other = _fit(recording, begin, found, one)
-                likelier = _weigh_common(other, best) - _weigh_common(best, other) > limit
+                # a gyro that errs for a moment turns nothing: its rows are those of a disturbed interval
+                turned = np.linalg.norm(fitted.rotation) > max(_LEAST, _SIGMAS * fitted.sigma)
+                likelier = bool(turned) and _weigh_common(other, best) - _weigh_common(best, other) > limit
                 kept, left = (other, best) if likelier else (best, other)
                 kept.passes.update(left.all_passes)
                 if likelier:

