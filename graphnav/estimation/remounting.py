@@ -177,6 +177,8 @@ def _find_changes(begun: Begun) -> tuple[Remounting, ...]:
     angle, k = _measure_changes(mountings[1], _MEANS[0])
     sigma = float(np.median(angle[np.abs(k - best) > _MEANS[0]])) / _MEDIAN
     vectors = _turn_by_rows(imu, bias, times, R_nb, (begin, end), rotation_vector), rotation_vector
+    if np.linalg.norm(vectors[0]) < _LEAST:  # as where a vehicle backs out: its course changes, and no gyro says so
+        return ()
     return tuple(Remounting(begin, end, tuple(one.tolist()), sigma) for one in vectors)
 
 
