@@ -155,7 +155,10 @@ def _find_changes(begun: Begun) -> tuple[Remounting, ...]:
     )
     if outstanding < _OUTSTANDING or largest < _LEAST:
         return ()
-    before, after = (_project(mountings[1][some].sum(axis=0)) for some in _list_beside(best, _MEANS[0]))
+    n = _MEANS[0]
+    before, after = (
+        _project(some.sum(axis=0)) for some in (mountings[1][best - n : best], mountings[1][best : best + n])
+    )
     rotation_vector = rotation.log(before.T @ after)
     imu, bias = begun.recording.imu, np.median(states.bg, axis=0)
     rows = np.flatnonzero((imu.t > max(t[best - 1] - _SEARCHED, problem.t[0])) & (imu.t <= t[best] + _SEARCHED))
@@ -174,8 +177,8 @@ def _find_changes(begun: Begun) -> tuple[Remounting, ...]:
     if done[behind[first]] - done[first] < _MOSTLY:
         return ()
     begin, end = a - beyond, b + beyond
-    angle, k = _measure_changes(mountings[1], _MEANS[0])
-    sigma = float(np.median(angle[np.abs(k - best) > _MEANS[0]])) / _MEDIAN
+    angle, k = _measure_changes(mountings[1], n)
+    sigma = float(np.median(angle[np.abs(k - best) > n])) / _MEDIAN
     vectors = _turn_by_rows(imu, bias, times, R_nb, (begin, end), rotation_vector), rotation_vector
     if np.linalg.norm(vectors[0]) < _LEAST:  # as where a vehicle backs out: its course changes, and no gyro says so
         return ()
@@ -192,11 +195,6 @@ def _turn_by_rows(imu: Imu, bias: Array, times: Array, R_nb: Array, span: tuple[
         rates.append(imu.gyro[some].mean(axis=0) - bias if some.any() else np.zeros(3))
     turned = 0.5 * (rates[0] + rotation.exp(near) @ rates[1]) * (times[end] - times[begin])
     return rotation.log(rotation.exp(-turned) @ R_nb[begin].T @ R_nb[end])
-
-
-def _list_beside(k: int, n: int) -> tuple[slice, slice]:
-    """The n before the k-th, and the n from there on."""
-    return slice(k - n, k), slice(k, k + n)
 
 
 def _measure_changes(mounting: Array, n: int) -> tuple[Array, Array]:

@@ -41,7 +41,7 @@ def choose_heading(problem: Problem, passes: Counter[str]) -> tuple[Problem, boo
     passes.update(filter=1, smoother=1)
     every = [
         (turn, evidence, *_measure_heading(one.states.R_nb[0], one.P[0, :3, :3]))
-        for turn, evidence, one in _solve_turned(first, smoothed, passes)
+        for turn, evidence, one in _solve_each_heading(first, smoothed, passes)
     ]
     if not every:
         return first, True
@@ -64,14 +64,14 @@ def compare_headings(problem: Problem, smoothed: SmootherPass, passes: Counter[s
     """What other initial headings add to the covariances (K, 15, 15) of a problem whose heading was chosen."""
     known = smoothed.P[:, :DIM, :DIM]
     more, total = np.zeros_like(known), -np.inf  # the logarithm of the sum of all evidences so far
-    for _, evidence, other in _solve_turned(problem, smoothed, passes):
+    for _, evidence, other in _solve_each_heading(problem, smoothed, passes):
         total = float(np.logaddexp(total, evidence))
         share, off = np.exp(evidence - total), other.states.minus(smoothed.states)
         more += share * (other.P[:, :DIM, :DIM] - known + off[:, :, None] * off[:, None, :] - more)
     return more
 
 
-def _solve_turned(
+def _solve_each_heading(
     problem: Problem, first: SmootherPass, passes: Counter[str]
 ) -> Iterator[tuple[float, float, SmootherPass]]:
     """From starts turned all around: the turn (rad), the logarithm of the evidence, the solution.
