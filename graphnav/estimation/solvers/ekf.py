@@ -41,6 +41,7 @@ from graphnav.estimation.solvers.decision import Decide, hold
 from graphnav.estimation.solvers.invariant import transport_covariance
 from graphnav.estimation.solvers.linearise import Points, advance
 from graphnav.estimation.solvers.passes import (
+    LINEAR_ATTITUDE,
     FilterPass,
     ForwardRecord,
     SmootherPass,
@@ -72,8 +73,9 @@ def ekf(
 
     Parameters
     ----------
-    opening : s, end of the span used by the alignment; up to there the filter runs twice. Estimates
-        after it depend on nothing later than themselves.
+    opening : s, end of the span used by the alignment; up to there, and on until the attitude is known well enough
+        for the filter's own points, it is linearised at smoothed ones. Estimates after that depend on nothing later
+        than themselves.
     known : linearisation points of the opening, from its first keyframe on, if better ones than a first pass's are
         known.
     decide : called after the updates of each keyframe; a smoother must not use the result.
@@ -82,11 +84,7 @@ def ekf(
     began = time.perf_counter()
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
-        about = (
-            _smooth_first(problem, smooth_backward(problem, _run_forward(problem, n)))[0]
-            if known is None
-            else known.take(slice(n))
-        )
+        about = _linearise_opening(problem, n, known)
     one = _run_forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
     # a copy: a view would keep the parameters' covariance in memory
@@ -158,6 +156,24 @@ def smooth_near(problem: Problem, about: Points, opening: float | None = None) -
     """
     smoothed, stay = _smooth_first(problem, about)
     return smoothed if stay else smooth_backward(problem, ekf(problem, opening=opening))
+
+
+def _linearise_opening(problem: Problem, n: int, known: Points | None) -> Points:
+    """Smoothed points of the first n keyframes, and of more until two sigmas of the attitude are linear."""
+    K, size = len(problem.t), n
+    about: Points | None = None
+    while True:
+        if known is None:
+            about = _smooth_first(problem, smooth_backward(problem, _run_forward(problem, size, about)))[0]
+        else:
+            about = known.take(slice(size))
+        if size == K:
+            return about
+        variance = np.diagonal(refilter(problem, about, whole=False).P[n - 1 :], axis1=1, axis2=2)
+        linear = np.flatnonzero(2.0 * np.sqrt(variance[:, :3].max(axis=1)) <= LINEAR_ATTITUDE)
+        if len(linear):
+            return about.take(slice(n + linear[0]))
+        size = min(2 * size, K)
 
 
 def _smooth_first(problem: Problem, about: Points) -> tuple[SmootherPass, bool]:
