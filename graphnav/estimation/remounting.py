@@ -97,8 +97,8 @@ def find_remountings(recording: Recording, begin: _Begin, begun: Begun) -> tuple
             with contextlib.suppress(*BREAKDOWN):
                 fitted, other = _fit(recording, begin, found, one)
                 # a gyro that errs for a moment turns nothing: its rows are those of a disturbed interval
-                turned = np.linalg.norm(fitted.rotation) > max(_LEAST, _SIGMAS * fitted.sigma)
-                likelier = bool(turned) and _weigh_common(other, best) - _weigh_common(best, other) > limit
+                turned = _is_turn(np.array(fitted.rotation), fitted.sigma)
+                likelier = turned and _weigh_common(other, best) - _weigh_common(best, other) > limit
                 kept, left = (other, best) if likelier else (best, other)
                 kept.passes.update(left.all_passes)
                 if likelier:
@@ -107,6 +107,11 @@ def find_remountings(recording: Recording, begin: _Begin, begun: Begun) -> tuple
             break
         found, begun = (*found, last), best
     return found
+
+
+def _is_turn(rotation_vector: Array, sigma: float) -> bool:
+    """Whether a rotation vector (3,), with its sigma about each axis, is more than errors explain, rad."""
+    return bool(np.linalg.norm(rotation_vector) > max(_LEAST, _SIGMAS * sigma))
 
 
 def _weigh_common(one: Begun, other: Begun) -> float:
@@ -134,6 +139,8 @@ def _fit(
             break
         R = rotation.exp(left) @ rotation.exp(np.array(one.rotation))
         one = replace(one, rotation=tuple(rotation.log(R).tolist()))
+        if not _is_turn(rotation.log(R), one.sigma):
+            break
         other = begin(undo_remountings(recording, (*found, one)), before=other)
     return one, other
 
@@ -179,9 +186,12 @@ def _find_changes(begun: Begun) -> tuple[Remounting, ...]:
     begin, end = a - beyond, b + beyond
     angle, k = _measure_changes(mountings[1], n)
     sigma = float(np.median(angle[np.abs(k - best) > n])) / _MEDIAN
-    vectors = _turn_by_rows(imu, bias, times, R_nb, (begin, end), rotation_vector), rotation_vector
-    if np.linalg.norm(vectors[0]) < _LEAST:  # as where a vehicle backs out: its course changes, and no gyro says so
+    by_rows = _turn_by_rows(imu, bias, times, R_nb, (begin, end), rotation_vector)
+    if np.linalg.norm(by_rows) < _LEAST:  # as where a vehicle backs out: its course changes, and no gyro says so
         return ()
+    apart = rotation.log(rotation.exp(-by_rows) @ rotation.exp(rotation_vector))
+    mostly = np.linalg.norm(apart) < _MOSTLY * np.linalg.norm(rotation_vector)  # or else the vehicle turned as well
+    vectors = (by_rows, rotation_vector) if mostly else (rotation_vector,)
     return tuple(Remounting(begin, end, tuple(one.tolist()), sigma) for one in vectors)
 
 
