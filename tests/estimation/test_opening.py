@@ -16,8 +16,9 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.passes import subtract_points
+from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, subtract_points
 from graphnav.estimation.solvers.rts import rts, smooth_backward, smooth_points
+from graphnav.evaluation.scoring import compute_errors
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,27 @@ def test_after_the_opening_the_filter_depends_on_nothing_later(start: Start) -> 
     np.testing.assert_array_equal(long.t[:K], short.t[:K])
     assert short.t[K - 1] > start.opening + 20.0
     np.testing.assert_allclose(long.states[:K].minus(short.states[:K]) / sigmas(short)[:K], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [1, 5, 7])
+def test_it_lasts_until_the_heading_is_known(shared_data: Path, seed: int) -> None:
+    """Position fixes of a vehicle that goes straight on do not tell it: behind the first bend attitudes are within
+    their sigmas, and depend on nothing later.
+    """
+    recording, truth = oracle.oracle_drive(shared_data, seed, odometer=False)
+    part = recording.crop(211.5, 300.0)
+    settings = parse_settings({"gnss": WHITE, "vehicle": NO_WHEELS})
+    frame = LocalFrame(part.gnss.llh[0])
+    aligned = align(part, settings, frame)
+    assert aligned.own_sigma[2] > LINEAR_ATTITUDE  # or the test would show nothing
+    long, short = (
+        ekf(build_problem(some, settings, frame, aligned.state, aligned.sigma), opening=aligned.until).solution
+        for some in (part, part.crop(0.0, 80.0))
+    )
+    k = np.flatnonzero((short.t > aligned.until + 10.0) & (short.t < short.t[-1]))
+    np.testing.assert_allclose(long.states[k].minus(short.states[k]) / sigmas(short)[k], 0.0, atol=1e-6)
+    errors = compute_errors(long.trajectory(), truth)
+    assert np.mean(errors.nees_rph[errors.t > aligned.until + 10.0]) / 3.0 < 3.0
 
 
 def test_innovations_are_as_large_as_stated(start: Start) -> None:

@@ -172,7 +172,8 @@ def _linearise_opening(problem: Problem, n: int, known: Points | None) -> Points
         variance = np.diagonal(refilter(problem, about, whole=False).P[n - 1 :], axis1=1, axis2=2)
         linear = np.flatnonzero(2.0 * np.sqrt(variance[:, :3].max(axis=1)) <= LINEAR_ATTITUDE)
         if len(linear):
-            return about.take(slice(n + linear[0]))
+            points = about.take(slice(n + linear[0]))
+            return points if known is not None or size == n else _smooth_first(problem, points)[0]
         size = min(2 * size, K)
 
 
