@@ -25,12 +25,11 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.contradictions import PRIOR_SIGMA, free
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import estimate_noise
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import FreedConstant
 from graphnav.estimation.noise.words import describe_turned_axes
 from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.problem import Problem, SolvedProblem, build_problem
-from graphnav.estimation.solvers.breakdown import explain_singular
+from graphnav.estimation.solvers.breakdown import BREAKDOWN, explain_singular
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.passes import SmootherPass, compute_sigmas, estimate_parameters, make_points

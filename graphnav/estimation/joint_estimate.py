@@ -29,13 +29,13 @@ from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.left_out import compute_excluded_share
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, VarianceComponent
 from graphnav.estimation.noise.priors import get_prior
 from graphnav.estimation.noise.scales import are_scales_contradicted
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.passes import carry_points
 from graphnav.imu.dynamics import PRIORS
 

@@ -34,12 +34,12 @@ from graphnav.estimation.joint_estimate import (
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.rivals import find_rivals
 from graphnav.estimation.noise.span_variances import weigh_excluded
 from graphnav.estimation.noise.tails import widen_by_tails
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 

@@ -37,7 +37,7 @@ from graphnav.estimation.noise.apply import apply_noise, are_of_others, drop_par
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.chords import find_filled_gaps
 from graphnav.estimation.noise.decision import weigh_rest
-from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
+from graphnav.estimation.noise.initial_points import find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spans import Span
 from graphnav.estimation.noise.tails import widen_by_tails, widen_unweighted
@@ -54,6 +54,7 @@ from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.relinearisation import is_clearly_worse, linearise_known, linearise_searched, relinearise
 from graphnav.estimation.solution import CarrierArcs
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (

@@ -11,8 +11,9 @@ import numpy as np
 from graphnav.core.progress import Progress
 from graphnav.core.state import States
 from graphnav.estimation.alignment import Alignment
-from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
+from graphnav.estimation.noise.initial_points import find_initial_points
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import (

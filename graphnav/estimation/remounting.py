@@ -29,11 +29,11 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.faults.watch import FAULT_COST
 from graphnav.estimation.noise.apply import apply_noise
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import Remounting
 from graphnav.estimation.noise.spans import Span
 from graphnav.estimation.preparation import Begun
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.linearise import Points, linearise, shift
 from graphnav.imu.preintegration import multiply_up
 from graphnav.recording import Imu, Recording, take_rows

@@ -21,12 +21,12 @@ from graphnav.core.state import BLOCKS, DIM
 from graphnav.estimation.names import name_rows
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.explanations import FIXES
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel, Rival
 from graphnav.estimation.noise.rivals import exclude
 from graphnav.estimation.noise.spans import Span
 from graphnav.estimation.noise.suspects import list_fix_times
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.passes import SmootherPass, reuse_points
 from graphnav.estimation.solvers.rts import smooth_backward

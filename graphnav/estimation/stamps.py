@@ -32,7 +32,6 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import shift_stamps, shift_stamps_back
 from graphnav.estimation.contradictions import Freed
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
 from graphnav.estimation.noise.spans import Span
 from graphnav.estimation.noise_search import Weigh
@@ -40,6 +39,7 @@ from graphnav.estimation.offsets import AS_STATED, is_offset_far, list_end_rows,
 from graphnav.estimation.preparation import Begun, Prepared
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ExcludedSpan, ParameterEstimate, Solution
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.linearise import Points, shift
 from graphnav.recording import Recording
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, is_certain

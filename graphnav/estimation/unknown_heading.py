@@ -19,8 +19,8 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, SmootherPass, are_near

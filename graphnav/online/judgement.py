@@ -34,7 +34,6 @@ from graphnav.estimation.noise.estimate import NoiseEstimate
 from graphnav.estimation.noise.exclusion import add_outliers
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_row_moments
 from graphnav.estimation.noise.outliers import compute_row_costs, list_reduced
@@ -43,6 +42,7 @@ from graphnav.estimation.noise.suspects import predict_left_out
 from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.passes import SmootherPass, reuse_points
 from graphnav.estimation.solvers.rts import smooth_backward, smooth_moments

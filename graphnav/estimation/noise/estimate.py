@@ -29,13 +29,14 @@ from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.components import Components, Squares, begin_components
 from graphnav.estimation.noise.information import compute_information, compute_tail_information
-from graphnav.estimation.noise.initial_points import BREAKDOWN, Initial, find_initial_points
+from graphnav.estimation.noise.initial_points import Initial, find_initial_points
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import ImuMoments, Moments, collect_moments, lag_moments
 from graphnav.estimation.noise.outliers import compute_interval_cost, compute_row_costs, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN
 from graphnav.estimation.noise.tails import CHANCE, compute_bounded_mean, estimate_tail_index, find_peak, weigh_scaled
 from graphnav.estimation.problem import ParameterChain, Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, ForwardRecord, MomentPass, are_near, reuse_points

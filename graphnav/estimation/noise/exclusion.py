@@ -66,7 +66,6 @@ from graphnav.estimation.noise.decision import (
 )
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.noise.moments import collect_imu_moments
 from graphnav.estimation.noise.outliers import may_pay
@@ -89,6 +88,7 @@ from graphnav.estimation.noise.suspects import (
     predict_left_out,
 )
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 
 _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
 

@@ -26,12 +26,12 @@ from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.faults.watch import FAULT_COST
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.explanations import FIXES, Trials, add_common_errors
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.noise.outliers import compute_row_costs
 from graphnav.estimation.noise.spans import drop_within, join
 from graphnav.estimation.noise.tails import relate_to_gaussian
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import reuse_points
 

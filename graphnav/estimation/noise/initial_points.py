@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri
 
-from graphnav.core.errors import EstimationError
 from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.faults.watch import SIZES
 from graphnav.estimation.noise.model import RowWeights
@@ -17,13 +16,13 @@ from graphnav.estimation.noise.moments import collect_row_moments
 from graphnav.estimation.noise.outliers import list_reduced
 from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying, weigh_scaled
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, linearise
 from graphnav.estimation.solvers.passes import SmootherPass, are_near
 from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.rts import smooth_points
 
-BREAKDOWN = EstimationError, np.linalg.LinAlgError  # errors of a filter with a numerically singular covariance
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
 _STEPS = 20  # of Gauss and Newton in a round at most; residuals of a heading that is still wrong tell nothing
 _SETTLED = 1e-2  # sigmas by which linearisation points may be off without effect

@@ -30,13 +30,13 @@ from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.decision import add_outliers, log_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, add_own_errors, measure_sizes
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, Rival
 from graphnav.estimation.noise.moments import predict_errors
 from graphnav.estimation.noise.outliers import compute_interval_cost, compute_row_costs
 from graphnav.estimation.noise.spans import LeftOutErrors, Span, drop_within, join_adjacent, mask_times
 from graphnav.estimation.noise.suspects import list_fix_times
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import MomentPass, reuse_points

@@ -9,6 +9,8 @@ import numpy as np
 from graphnav.constraints.base import Constraint
 from graphnav.core.errors import EstimationError
 
+BREAKDOWN = EstimationError, np.linalg.LinAlgError  # errors of a filter with a numerically singular covariance
+
 
 def explain_singular(error: np.linalg.LinAlgError) -> EstimationError:
     """Error for a matrix that became singular."""

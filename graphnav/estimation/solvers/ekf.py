@@ -24,6 +24,7 @@ throughout.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Collection
 from functools import partial
@@ -37,6 +38,7 @@ from graphnav.core.state import DIM
 from graphnav.estimation.faults.search import FaultSearch, free
 from graphnav.estimation.faults.watch import Bank
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import BREAKDOWN
 from graphnav.estimation.solvers.decision import Decide, hold
 from graphnav.estimation.solvers.invariant import transport_covariance
 from graphnav.estimation.solvers.linearise import Points, advance
@@ -159,22 +161,33 @@ def smooth_near(problem: Problem, about: Points, opening: float | None = None) -
 
 
 def _linearise_opening(problem: Problem, n: int, known: Points | None) -> Points:
-    """Smoothed points of the first n keyframes, and of more until two sigmas of the attitude are linear."""
+    """Smoothed points of the first n keyframes, and of more until two sigmas of the attitude are linear.
+
+    Of n only where those of more do not converge.
+    """
+    first = about = _smooth_opening(problem, n)[0] if known is None else known.take(slice(n))
     K, size = len(problem.t), n
-    about: Points | None = None
-    while True:
-        if known is None:
-            about = _smooth_first(problem, smooth_backward(problem, _run_forward(problem, size, about)))[0]
-        else:
-            about = known.take(slice(size))
-        if size == K:
-            return about
-        variance = np.diagonal(refilter(problem, about, whole=False).P[n - 1 :], axis1=1, axis2=2)
-        linear = np.flatnonzero(2.0 * np.sqrt(variance[:, :3].max(axis=1)) <= LINEAR_ATTITUDE)
-        if len(linear):
-            points = about.take(slice(n + linear[0]))
-            return points if known is not None or size == n else _smooth_first(problem, points)[0]
-        size = min(2 * size, K)
+    with contextlib.suppress(*BREAKDOWN):
+        while size < K:
+            variance = np.diagonal(refilter(problem, about, whole=False).P[n - 1 :], axis1=1, axis2=2)
+            linear = np.flatnonzero(2.0 * np.sqrt(variance[:, :3].max(axis=1)) <= LINEAR_ATTITUDE)
+            if len(linear):
+                points = about.take(slice(n + linear[0]))
+                return points if known is not None or size == n else _smooth_first(problem, points)[0]
+            size = min(2 * size, K)
+            if known is not None:
+                about = known.take(slice(size))
+            else:
+                about, converged = _smooth_opening(problem, size, about)
+                if not converged:
+                    return first
+        return about
+    return first
+
+
+def _smooth_opening(problem: Problem, n: int, about: Points | None = None) -> tuple[SmootherPass, bool]:
+    """As `_smooth_first` of the first n keyframes, with points for some of these."""
+    return _smooth_first(problem, smooth_backward(problem, _run_forward(problem, n, about)))
 
 
 def _smooth_first(problem: Problem, about: Points) -> tuple[SmootherPass, bool]:
