@@ -217,12 +217,18 @@ def solve(job: Job) -> list[Row]:
         else:
             online, tracks = run_online(used, settings)
             seconds = time.process_time() - began
-            metrics = {name: evaluate_online(track, part, withheld) for name, track in tracks.items()}
+            metrics, unknown = {}, {}
+            for name, track in tracks.items():
+                try:
+                    metrics[name] = evaluate_online(track, part, withheld)
+                except graphnav.GraphnavError as error:  # of what is known at once there may be nothing to compare
+                    unknown[name] = {"error": str(error)}
             false_stops = 0 if online.tracker is None else len(online.tracker.noise.false_stops)
             more = {"seconds": round(seconds, 2), "false_stops": false_stops, "notes": online.notes}
-            out = dict.fromkeys(tracks, left_out(used, online.excluded) | more)
+            common = left_out(used, online.excluded) | more
+            out = {name: common | unknown.get(name, {}) for name in tracks}
         for row in rows:
-            said = summarise(metrics[row["solver"]])
+            said = summarise(metrics[row["solver"]]) if row["solver"] in metrics else {}
             row |= {"h": said.get("h_rms_m"), "up": said.get("up_rms_m"), "nees": said.get("nees_p")}
             row |= out[row["solver"]]
     except Exception as error:  # another kind than GraphnavError is a bug; the table shows it and goes on
@@ -233,7 +239,15 @@ def solve(job: Job) -> list[Row]:
 
 
 def evaluate_online(track: Track, recording: Recording, withheld: tuple[Withheld, ...]) -> Metrics:
-    """Errors of a trajectory that came out online."""
+    """Errors of a trajectory that came out online.
+
+    Raises
+    ------
+    GraphnavError
+        If there is nothing to compare.
+    """
+    if not track.pieces:
+        raise graphnav.GraphnavError("nothing was known before the end")
     whole, antenna = track.join()
     metrics = evaluate_recording(whole, recording, withheld=withheld, antenna=antenna)
     assert metrics is not None

@@ -42,13 +42,13 @@ def run_online(recording: Recording, settings: Settings) -> tuple[Online, dict[s
     """The smoother at the end, and what settled and what was known just after each keyframe."""
     assert recording.gnss is not None
     online, tracks, newest = Online(drop_rows(recording), settings), {"settled": Track(), "at once": Track()}, -np.inf
-    antenna = np.concatenate([recording.gnss.lever_arm, np.zeros(2)])
+    antenna = stated = np.concatenate([recording.gnss.lever_arm, np.zeros(2)])
     for row in list_rows(recording)[1]:
         online.add(row)
         if online.tracker is None or online.tracker.newest <= newest:
             continue
         newest, state = online.tracker.newest, online.tracker.window.newest
-        antenna = antenna.copy()
+        antenna = stated.copy()  # what a noise model has freed may be as stated by the next one
         for name, at in ((LEVER_ARM, slice(0, 3)), (TIME_OFFSET, slice(3, 4)), (CLOCK_RATE, slice(4, 5))):
             if name in state.columns:
                 antenna[at] = state.get_value(name)
@@ -57,6 +57,6 @@ def run_online(recording: Recording, settings: Settings) -> tuple[Online, dict[s
             tracks["at once"].add([now], antenna)
     online.finish()
     tracks["settled"].add(online.settled(), antenna)
-    if not all(track.pieces for track in tracks.values()):
-        raise GraphnavError(f"not aligned before the end: {online.notes[-1] if online.notes else 'too few rows'}")
+    if not tracks["settled"].pieces:
+        raise GraphnavError(f"nothing has settled: {online.explain_start()}")
     return online, tracks

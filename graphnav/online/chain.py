@@ -43,6 +43,7 @@ from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.online.looks import SURE, Stops
 from graphnav.online.sensors import Sensors
 from graphnav.recording import Recording
+from graphnav.recording.plausibility.fixes import GRIP
 
 _PLACE_SIGMA = 1000.0  # m, prior 1-sigma of the position of a stop
 _FEWEST_FOR_PERIOD = 5  # fixes from which their period is known
@@ -87,7 +88,7 @@ class Chain:
         self._head_held = Held()
         self.epochs = self.fixed = 0  # settled keyframes with carriers, and those of them that are fixed
         self._parameters: dict[str, Parameter] = {}
-        self._gaps = np.empty(0)  # s, ends of gaps of the IMU that are filled in
+        self._gaps = np.empty((0, 2))  # (M, 2) s, gaps of the IMU that are filled in
         # whether some state has moved so far from its linearisation point that it may have to be relinearised
         self._turned = False
 
@@ -205,7 +206,7 @@ class Chain:
             turn = max(turn, self._push(problem, k, ahead))
             ahead = None
             fault, tests = self.window.stages[-1].fault, self.window.newest.tests
-            if tests is not None and self._follows_gap(float(problem.t[k])):
+            if tests is not None and self._follows_gap(float(problem.t[k]), tests):
                 self.window.watch(tests.forget_onsets())
                 fault = None
             if fault is not None and problem.t[k] > self.judged + SAME_TIME:
@@ -223,21 +224,26 @@ class Chain:
         self._turned |= turn > self.window.turn
         return None
 
-    def _note_gaps(self, ends: Array) -> None:
-        """Remember where gaps of the IMU end (s) that are filled in."""
-        ends = np.union1d(self._gaps[self._gaps > self.head], ends)
-        self._gaps = ends[np.append(np.diff(ends) > SAME_TIME, True)[: len(ends)]]
+    def _note_gaps(self, gaps: Array) -> None:
+        """Remember the gaps (M, 2) of the IMU that are filled in, s."""
+        gaps = np.concatenate([self._gaps[self._gaps[:, 1] > self.head], gaps])
+        gaps = gaps[np.argsort(gaps[:, 1], kind="stable")]
+        self._gaps = gaps[np.append(np.diff(gaps[:, 1]) > SAME_TIME, True)[: len(gaps)]]
 
-    def _follows_gap(self, t: float) -> bool:
+    def _follows_gap(self, t: float, tests: Watch) -> bool:
         """Whether a keyframe is behind a gap of the IMU with so few fixes since that what was filled in, as an error of
-        place, velocity and attitude, explains them as well as a fault of theirs.
+        place, velocity and attitude, explains them as well as a fault of theirs; in a short one nothing happens that is
+        as large as a fault.
         """
-        for end in self._gaps[(self._gaps <= t + SAME_TIME) & (self._gaps > t - PATIENCE)].tolist():
-            for name, times in self.verdicts.times.items():
-                before = int(times.searchsorted(end))
-                since = int(times.searchsorted(t + SAME_TIME)) - before
-                if since <= _FIXES_FOR_A_STATE and (not before or self.verdicts.used[name][before - 1] > 0.0):
-                    return True
+        begin, end = self._gaps[(self._gaps[:, 1] <= t + SAME_TIME) & (self._gaps[:, 1] > t - PATIENCE)].T
+        speed = float(np.linalg.norm(self.window.newest.state.v))
+        for name, times in self.verdicts.times.items():
+            before = times.searchsorted(end)
+            since = times.searchsorted(t + SAME_TIME) - before
+            new = (since <= _FIXES_FOR_A_STATE) & ((before == 0) | (self.verdicts.used[name][before - 1] > 0.0))
+            moved = GRIP * (end - begin)[new]  # m/s at most
+            if new.any() and name in tests and tests.would_seem_wrong(name, moved, (t - begin)[new], speed):
+                return True
         return False
 
     def _push(self, problem: Problem, k: int, ahead: Predicted | None) -> float:

@@ -53,8 +53,9 @@ from graphnav.recording import Recording
 _REPLAYED_PORTION = 4  # keyframes processed again per row
 _ENOUGH_FIXES = 600  # fixes in motion, which determine variances to 6 %
 _LONGEST_SPAN = 900.0  # s of rows after which estimation ends where fixes are rare
-# of the lag, and s: time allowed for the estimation, 11 s for 1100 keyframes
+# of the lag, and s: time allowed for the estimation at most
 _THINKING, _LONGEST_THOUGHT = 1.0 / 8.0, 20.0
+_FIRST_THOUGHT, _THOUGHT = 2.0, 0.02  # s, and s a keyframe: three times what loading its code takes, and twice the work
 
 
 @dataclass(frozen=True)
@@ -266,7 +267,8 @@ def start_estimation(
     last : whether none follows, so that what these rows leave open stays so, as offline.
     """
     recording, every = (sensors.make_recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
-    due = float(times[-1]) + limit_thought(settings.solver.lag)
+    # until then rows are smoothed with noise that is known less well
+    due = float(times[-1]) + min(_FIRST_THOUGHT + _THOUGHT * len(times), limit_thought(settings.solver.lag))
     settings = drop_ambiguities(settings, sensors.setup)
     return BackgroundEstimation(
         EstimationTask(recording, every, settings, frame, found, times, sensors.gnss.compute_unit(), before, last), due

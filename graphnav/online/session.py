@@ -126,8 +126,7 @@ class Session:
             return
         if self.online is None:
             raise RecordingError("the source ended before the line that describes its sensors", key="online.no_setup")
-        counts, notes = self.online.sensors.counts, self.online.notes
-        why = notes[-1] if notes else "too few rows to align with"
+        counts, why = self.online.sensors.counts, self.online.explain_start()
         if not counts["imu"]:
             odd = [f"{n} {key}" for key, n in counts.items() if key.startswith("imu:")]
             why = "; ".join(["no row of the IMU was taken in", *odd, *self.complaints[:1]])

@@ -6,7 +6,7 @@ import traceback
 from pathlib import Path
 
 from graphnav.config import Settings, parse_settings
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Note, format_count, get_key
 from graphnav.online.checks import check_counts
 from graphnav.online.sensors import Row
 from graphnav.online.smoother import Smoother
@@ -81,6 +81,17 @@ class Online(Smoother):
         except Exception as error:
             self._give_up(error)
         self._tell_counts()
+
+    def explain_start(self) -> str:
+        """Tell why nothing has settled yet.
+
+        Returns
+        -------
+        str
+            The newest reason among the notes.
+        """
+        why = [note for note in self.notes if get_key(note) in ("online.not_aligned", "online.failed")]
+        return why[-1] if why else "too few rows to align with"
 
     def _tell_counts(self) -> None:
         """Note what the rows left out so far say of the sensors."""

@@ -207,7 +207,7 @@ class Tracker(Chain):
         T, start = self.newest, self.window.newest.state
         imu = cut_around(sensors, T, sensors.imu.newest).imu
         samples, ends = bridge_gaps(imu, T), np.array([T, expected])
-        self._note_gaps(samples.bridged[:, 1])
+        self._note_gaps(samples.bridged)
         interval = preintegrate(samples, imu, ends, start.ba[0], start.bg[0], self._estimates_imu)
         self._motions[expected] = ImuFactors(interval, self.frame).prepare()
 
@@ -364,7 +364,7 @@ class Tracker(Chain):
             recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known,
             self._steps.highest, complete, self._estimates_imu,
         )  # fmt: skip
-        self._note_gaps(problem.samples.bridged[:, 1])
+        self._note_gaps(problem.samples.bridged)
         for k, t in enumerate(times[1:].tolist()):
             if t not in known:
                 self._motions[t] = ImuFactors(problem.intervals[k : k + 1], self.frame)

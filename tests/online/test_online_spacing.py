@@ -1,14 +1,16 @@
-"""A receiver that reports fast: online uses the best fix of every second, as a whole drive does."""
+"""A receiver that reports fast: online uses the best fix of every second, as a whole drive does. One that is slow."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import oracle
 import pytest
 from test_online import joined
 
+from graphnav import load
 from graphnav.config import parse_settings
 from graphnav.constraints.gnss import STAMP_ERROR, STAMPS
 from graphnav.constraints.lasting import MULTIPATH_ERROR
@@ -21,10 +23,27 @@ from graphnav.gnss.residuals import compute_multipath_sigma
 from graphnav.online import Online, drop_rows, list_rows
 from graphnav.online.noise_estimation import CatchUp
 from graphnav.online.sensors import Sensors
-from graphnav.recording import Gnss, Imu, Recording
+from graphnav.recording import Gnss, Imu, Recording, take_rows
 
 QUICK = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 60.0}})
 NAN = float("nan")
+
+
+def test_a_drive_with_rare_fixes_begins_before_ten_have_come(shared_data: Path) -> None:
+    """Every eight seconds: what it begins with is as true as its sigmas say."""
+    drive = load(shared_data / "oracle_drive").crop(253.4, 310.4)
+    assert drive.gnss is not None
+    assert drive.truth is not None
+    rare = replace(drive, gnss=take_rows(drive.gnss, np.arange(len(drive.gnss.t)) % 8 == 0))
+    online = Online(drop_rows(rare), QUICK)
+    for row in list_rows(rare)[1]:
+        online.add(row)
+    assert online.tracker is not None
+    message, truth = online.tracker.window.newest, drive.truth
+    k = int(np.argmin(np.abs(truth.t - online.tracker.newest)))
+    assert abs(truth.t[k] - online.tracker.newest) < 1e-3
+    off = message.state.p[0] - online.tracker.frame.from_llh(truth.llh[k][None])[0]
+    assert off @ np.linalg.solve(message.covariance[3:6, 3:6], off) < 21.1  # once in ten thousand times
 
 
 @pytest.mark.parametrize("late", [0, 7])

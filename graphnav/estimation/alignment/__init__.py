@@ -31,7 +31,12 @@ from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.alignment.course import COURSE_SIGMA
 from graphnav.estimation.alignment.first import Alignment
-from graphnav.estimation.alignment.motion import align_in_motion, drop_implausible, find_motion_span
+from graphnav.estimation.alignment.motion import (
+    FEWEST_FIXES,
+    align_in_motion,
+    drop_implausible,
+    find_motion_span,
+)
 from graphnav.estimation.alignment.rest import level_at_rest
 from graphnav.recording import Recording
 
@@ -69,11 +74,14 @@ def align(
 def is_ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:
     """Whether the fixes so far contain all the motion that an alignment needs, or two antennas give the heading.
 
+    Of rare fixes it uses more if they are there, but nobody waits for these: its sigmas are as true with fewer.
+
     Parameters
     ----------
     stationary : as for `align`; None where stops have not been detected yet: it may stand throughout.
     """
-    span = find_motion_span(drop_implausible(recording), settings, NONE if stationary is None else stationary)
+    stands = NONE if stationary is None else stationary
+    span = find_motion_span(drop_implausible(recording), settings, stands, FEWEST_FIXES)
     if span is None:
         return measure_baseline_heading(recording, settings, stationary) is not None
     return recording.gnss is not None and span[1] < recording.gnss.t[-1]

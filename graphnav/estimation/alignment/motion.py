@@ -35,6 +35,7 @@ from graphnav.recording.plausibility.fixes import GRIP
 # rad, to which the fixes must determine the direction of travel: better than the other contributions
 _DIRECTION = 0.5 * COURSE_SIGMA
 _WANTED_FIXES = 10  # fixes that the short problem should contain
+FEWEST_FIXES = 5  # of three numbers each, without which it cannot determine the fifteen of a state
 _FEWEST_FOR_ACCELERATION = 3  # fixes without which there is no acceleration
 _MOVING_SIGMAS = 5.0  # sigmas of travel that count as motion: noise reaches them once in 270 000 fixes, exp(-5^2/2)
 _LEAD_TIME = 10.0  # s of the span before the motion
@@ -84,12 +85,15 @@ def _find_usual(sd: Array) -> Array:
     return np.asarray(medians[np.clip(np.arange(len(sd)) - size // 2, 0, len(medians) - 1)])
 
 
-def find_motion_span(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
+def find_motion_span(
+    recording: Recording, settings: Settings, stationary: Array = NONE, wanted: int = _WANTED_FIXES
+) -> tuple[float, float] | None:
     """The span (s) to align over: from just before the first motion until there has been enough of it.
 
     The platform moves where it is farther away than errors of the fixes explain, over ground or in its own axes
     (`graphnav.estimation.alignment.travel`); there is enough motion once these errors leave little doubt about the
-    direction. Apparent motion of the fixes while a vehicle is stationary, `stationary` (N, 2) s, does not count.
+    direction, after `wanted` fixes at least. Apparent motion of the fixes while a vehicle is stationary, `stationary`
+    (N, 2) s, does not count.
     """
     gnss = recording.gnss
     if gnss is None:
@@ -112,7 +116,7 @@ def find_motion_span(recording: Recording, settings: Settings, stationary: Array
         return None
     first = int(np.argmax(away))
     enough = (way.times_sigma > 1.0 / np.tan(_DIRECTION)) & (t > t[first] + settings.alignment.window)
-    enough &= np.arange(len(t)) >= first + _WANTED_FIXES
+    enough &= np.arange(len(t)) >= first + wanted
     last = int(np.argmax(enough)) if enough.any() else len(t) - 1
     # at the speed that followed, it took a while to get that far
     speed = np.abs(way.D[last] - way.D[first]) / max(t[last] - t[first], 1.0)

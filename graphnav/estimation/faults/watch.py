@@ -366,5 +366,11 @@ class Watch:
         add_row(slots.memory, rho, Gamma, slots.L, slots.c, errors, T)
         return slots.find(t, errors, T, slots.typical_sigmas.factor, speed)
 
+    def would_seem_wrong(self, name: str, dv: Array, since: Array, speed: float) -> bool:
+        """Whether fixes would be off by as much as by a fault where the velocity is off by dv (n,) m/s since (n,) s."""
+        slots = self._slots[name]
+        away = np.max(dv * since if slots.fix_of == "p" else dv)
+        return bool(_are_large(np.full(slots.m, away), slots.typical_error, slots.fix_of, speed))
+
     def __contains__(self, name: str) -> bool:
         return name in self._slots
