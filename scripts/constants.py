@@ -2,6 +2,7 @@
 
     python scripts/constants.py --data ../shared/data
     python scripts/constants.py --data ../shared/data --only CHANCE,SIZES --length 300
+    python scripts/constants.py --data ../shared/data --of remounting --changed turned-imu --drives tokyo,oracle,boulder
 
 The figures that are estimated from a recording rest on some that are not: probabilities, priors, physics, and how long
 the computing may take. The table shows for each of these the horizontal errors of filter and smoother (the geometric
@@ -23,6 +24,7 @@ from typing import Any
 import numpy as np
 from damage import DAMAGES
 from do_no_harm import DRIVES, HERE, load, placed, settings_of, windows, withheld_of
+from drive_changes import CHANGES
 from harm_verdict import FLOOR
 
 import graphnav
@@ -30,6 +32,7 @@ from graphnav.app.scores import Withheld, score
 from graphnav.recording import Recording
 
 NOISE, FAULTS = "graphnav.estimation.noise", "graphnav.estimation.faults"
+TURNED = "graphnav.estimation.remounting"
 SOLVED = ("ekf", "rts")
 DAMAGED = ("bursts", "drifting")
 
@@ -47,12 +50,14 @@ class Constant:
     def values(self, usual: Any) -> Iterator[tuple[str, Any]]:
         """What is tried, with a word for it."""
         for factor in (1.0 / self.times, self.times):
+
+            def scale(x: float, factor: float = factor) -> float:
+                return max(1, round(x * factor)) if self.whole else x * factor
+
             if isinstance(usual, dict):
-                value: Any = {key: x * factor for key, x in usual.items()}
-            elif isinstance(usual, tuple):
-                value = tuple(x * factor for x in usual)
+                value: Any = {key: scale(x) for key, x in usual.items()}
             else:
-                value = max(1, round(usual * factor)) if self.whole else usual * factor
+                value = tuple(map(scale, usual)) if isinstance(usual, tuple) else scale(usual)
             yield f"x {factor:g}", value
 
 
@@ -115,6 +120,7 @@ CONSTANTS = (
         "LINEAR_ATTITUDE",
         "rad: half its square is the share of a vector that linearising loses",
     ),
+    Constant("graphnav.estimation.unknown_heading", "_PASSES", "computing: passes from each heading", 2.0, whole=True),
     Constant("graphnav.estimation.noise_search", "_MOST_WRONG", "the larger part"),
     Constant(
         "graphnav.estimation.relinearisation",
@@ -125,6 +131,22 @@ CONSTANTS = (
     Constant(
         "graphnav.estimation.contradictions", "_WIDER", "sigmas: a drive's own estimate counts a quarter too much"
     ),
+    Constant(TURNED, "_MEANS", "keyframes: enough for a mean of mountings", 2.0, whole=True),
+    Constant(TURNED, "_MOVING", "of the usual speed, and m/s: slower, the course is uncertain"),
+    Constant(TURNED, "_OUTSTANDING", "computing: less is not looked into", 1.5),
+    Constant(TURNED, "_LEAST", "rad, as slip in a turn may seem"),
+    Constant(TURNED, "_BEGUN", "share of the turn by which its begin is found"),
+    Constant(TURNED, "_DONE", "share of the turn by which its end is found", 1.2),
+    Constant(TURNED, "_BEYOND", "of the time between these: the rest, and slow ends"),
+    Constant(TURNED, "_SIGMAS", "sigmas that a turn is larger than"),
+    Constant(TURNED, "_LONGEST", "s that a hand takes to turn a device"),
+    Constant(TURNED, "_MOSTLY", "share of the change that is to come about within these", 1.5),
+    Constant(TURNED, "_RATE", "s beside it in which the vehicle's turn rate is measured"),
+    Constant(TURNED, "_SEARCHED", "computing: s about the keyframes between which it is"),
+    Constant(TURNED, "_BESIDE", "s before and after in which the wheels tell its angle"),
+    Constant(TURNED, "_SETTLED", "computing: rad of a step at convergence", 3.0),
+    Constant(TURNED, "_STEPS", "computing: steps to the angle", 2.0, whole=True),
+    Constant(TURNED, "_MOST", "computing: turns of a drive", 2.0, whole=True),
     Constant("graphnav.recording", "ACROSS", "data sheets: axes square to 0.05 deg beside scales good to 0.3 %"),
 )
 DERIVED = {
@@ -188,12 +210,15 @@ def cells(options: argparse.Namespace) -> Iterator[Cell]:
         whole = load(source)
         for _, span in windows(whole, drive.source, options):
             part = whole.crop(*span)
+            part = CHANGES[options.changed](part) if options.changed else part
             withheld = withheld_of(part, part.duration) if part.truth is None else ()
             used = part
             for sensor, some in withheld:
                 used = used.without(sensor, some)
             sensors = "+odometer" if part.odometer is not None else "+nhc"
             yield Cell(name, part, used, settings_of("estimated", sensors, drive.doppler), withheld)
+    if options.changed:
+        return
     clone = graphnav.load(HERE / "data" / "tokyo")
     assert clone.gnss is not None
     for kind in DAMAGED:
@@ -216,6 +241,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--drives", help="names, with commas between (all)")
     parser.add_argument("--only", help="names of constants, with commas between")
+    parser.add_argument("--of", help="name of a module, all of whose constants are wanted")
+    parser.add_argument(
+        "--changed", choices=CHANGES, help="drives changed as by do_no_harm.py, instead of damaged fixes"
+    )
     options = parser.parse_args(arguments)
     options.whole = False
     every = list(cells(options))
@@ -225,6 +254,8 @@ def main(arguments: list[str] | None = None) -> None:
     print("| --- | ---: | --- | ---: | ---: | ---: | --- | ---: |")
     for constant in CONSTANTS:
         if options.only and constant.name not in options.only.split(","):
+            continue
+        if options.of and constant.module.rsplit(".", 1)[1] != options.of:
             continue
         here = getattr(importlib.import_module(constant.module), constant.name)
         for word, value in constant.values(here):

@@ -25,6 +25,7 @@ from graphnav.core.errors import GraphnavError
 from graphnav.core.notes import get_key
 from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Imu, ImuNoise, Recording
@@ -139,6 +140,12 @@ def at_rate(recording: Recording, rate: float) -> Recording:
     return replace(
         recording, imu=replace(imu, t=imu.t[n - 1 : count * n : n], gyro=mean(imu.gyro), accel=mean(imu.accel))
     )
+
+
+def thin_fixes(recording: Recording, every: int) -> Recording:
+    """The recording with one fix of so many."""
+    assert recording.gnss is not None
+    return replace(recording, gnss=pick_fixes(recording.gnss, np.arange(0, len(recording.gnss.t), every)))
 
 
 def forget_residuals(recording: Recording) -> Recording:

@@ -16,11 +16,13 @@ from functools import partial
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.foot import Stance
 from graphnav.constraints.odometer import average_speed
 from graphnav.core.beside import Beside, Later, begin_beside, may_begin
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
+from graphnav.core.interpolation import pick_nearest
 from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, tell
 from graphnav.core.rotation import Array
@@ -154,6 +156,23 @@ class Begun:
         assert self.found is not None
         self.passes.update(filter=1)
         return self.found.estimate.log_evidence - weigh_rest(self.found.base, self.found.estimate, some)
+
+    def weigh_lacking(
+        self,
+        ours: Mapping[str, tuple[Array, Array]],
+        theirs: Mapping[str, tuple[Array, Array]],
+        within: float = SAME_TIME,
+    ) -> float:
+        """The same without the rows that others do not have; rows are (N,) s by constraint: what they are compared by,
+        which may differ by `within`, and their times.
+        """
+        lacking = {}
+        for name, (stamps, t) in ours.items():
+            other = theirs[name][0] if name in theirs else np.empty(0)
+            some = t[np.abs(other[pick_nearest(other, stamps)] - stamps) > within] if len(other) else t
+            if len(some):
+                lacking[name] = tuple((x, x) for x in some.tolist())
+        return self.weigh_measurements(lacking) if lacking else 0.0
 
     def estimate_parameters(self, far: float) -> tuple[Problem, Array, Array] | None:
         """The problem, its parameters (D-15,) at the end and their covariance; None where no stamp is as far off, s."""

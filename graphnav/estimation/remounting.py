@@ -20,17 +20,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.vehicle import NHC_ERROR, NonHolonomic
 from graphnav.core import rotation
-from graphnav.core.interpolation import pick_nearest
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.faults.watch import FAULT_COST
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import Remounting
-from graphnav.estimation.noise.spans import Span
 from graphnav.estimation.preparation import Begun
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import BREAKDOWN
@@ -96,9 +93,7 @@ def find_remountings(recording: Recording, begin: _Begin, begun: Begun) -> tuple
         for one in _find_changes(begun):
             with contextlib.suppress(*BREAKDOWN):
                 fitted, other = _fit(recording, begin, found, one)
-                # a gyro that errs for a moment turns nothing: its rows are those of a disturbed interval
-                turned = _is_turn(np.array(fitted.rotation), fitted.sigma)
-                likelier = turned and _weigh_common(other, best) - _weigh_common(best, other) > limit
+                likelier = _is_turn(fitted) and _weigh_common(other, best) - _weigh_common(best, other) > limit
                 kept, left = (other, best) if likelier else (best, other)
                 kept.passes.update(left.all_passes)
                 if likelier:
@@ -109,29 +104,24 @@ def find_remountings(recording: Recording, begin: _Begin, begun: Begun) -> tuple
     return found
 
 
-def _is_turn(rotation_vector: Array, sigma: float) -> bool:
-    """Whether a rotation vector (3,), with its sigma about each axis, is more than errors explain, rad."""
-    return bool(np.linalg.norm(rotation_vector) > max(_LEAST, _SIGMAS * sigma))
+def _is_turn(one: Remounting) -> bool:
+    """Whether it turns: a gyro that errs for a moment does not, and its rows are those of a disturbed interval."""
+    return bool(np.linalg.norm(one.rotation) > max(_LEAST, _SIGMAS * one.sigma))
 
 
 def _weigh_common(one: Begun, other: Begun) -> float:
     """The logarithm of the evidence of the rows that another problem has as well: both stand at other times."""
     assert one.found is not None
     assert other.found is not None
-    ours, theirs = ({c.name: x.t[c.keyframe] for c in x.constraints} for x in (one.found.base, other.found.base))
-    beyond: dict[str, tuple[Span, ...]] = {}
-    for name, t in ours.items():
-        same = theirs.get(name, np.empty(0))
-        apart = np.abs(same[pick_nearest(same, t)] - t) if len(same) else np.full(len(t), np.inf)
-        if (lacking := t[apart > SAME_TIME]).size:
-            beyond[name] = tuple((x, x) for x in lacking.tolist())
-    return one.log_evidence - (one.weigh_measurements(beyond) if beyond else 0.0)
+    problems = one.found.base, other.found.base
+    ours, theirs = ({c.name: (x.t[c.keyframe],) * 2 for c in x.constraints} for x in problems)
+    return one.log_evidence - one.weigh_lacking(ours, theirs)
 
 
 def _fit(
     recording: Recording, begin: _Begin, found: tuple[Remounting, ...], one: Remounting
 ) -> tuple[Remounting, Begun]:
-    """The turn by which the wheels roll the same way before and after."""
+    """The turn by which the wheels roll the same way before and after; or one as small as is none."""
     other = begin(undo_remountings(recording, (*found, one)))
     for _ in range(_STEPS):
         left = _measure_rest(other, one)
@@ -139,7 +129,7 @@ def _fit(
             break
         R = rotation.exp(left) @ rotation.exp(np.array(one.rotation))
         one = replace(one, rotation=tuple(rotation.log(R).tolist()))
-        if not _is_turn(rotation.log(R), one.sigma):
+        if not _is_turn(one):
             break
         other = begin(undo_remountings(recording, (*found, one)), before=other)
     return one, other

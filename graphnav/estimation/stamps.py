@@ -27,7 +27,6 @@ from graphnav.constraints.antenna_motion import LINEAR_OFFSET
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
 from graphnav.constraints.odometer import ODOMETER_DELAY
-from graphnav.core.interpolation import pick_nearest
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import shift_stamps, shift_stamps_back
@@ -81,15 +80,10 @@ class _Candidate:
 
     def _weigh_fixes(self, other: _Candidate) -> float:
         assert self.begun.found is not None
-        theirs, beyond = other._list_stamps(), dict[str, tuple[Span, ...]]()
-        for name, (own, t) in self._list_stamps().items():
-            same = theirs[name][0] if name in theirs else np.empty(0)
-            apart = np.abs(same[pick_nearest(same, own)] - own) if len(same) else np.full(len(own), np.inf)
-            if (lacking := t[apart > 10.0 * SAME_TIME]).size:  # both rounded
-                beyond[name] = tuple((x, x) for x in lacking.tolist())
         gained = self.log_evidence - self.begun.found.estimate.log_evidence  # by what is free or left out
         of_fixes = self.begun.weigh_measurements(dict.fromkeys(_OWN_STAMPS, ((-np.inf, np.inf),)))
-        return gained + of_fixes - (self.begun.weigh_measurements(beyond) if beyond else 0.0)
+        within = 10.0 * SAME_TIME  # both rounded
+        return gained + of_fixes - self.begun.weigh_lacking(self._list_stamps(), other._list_stamps(), within)
 
     def _list_stamps(self) -> dict[str, tuple[Array, Array]]:
         """(N,) s, stamps of fixes by constraint, on their own clock and that of the IMU."""

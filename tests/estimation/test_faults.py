@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import oracle
 import pytest
-from helpers import refused
+from helpers import refused, thin_fixes
 
 from graphnav.config import Settings, parse_settings
 from graphnav.core.beside import Later
@@ -19,7 +19,6 @@ from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
-from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.building import Clock, ProblemBuilder
 from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
 from graphnav.estimation.faults.likelihood_ratio import update_tests
@@ -417,8 +416,7 @@ def test_reflections_that_follow_each_other_are_left_out(shared_data: Path) -> N
     more than jumps of the vehicle that the IMU has missed.
     """
     recording = read(shared_data / "boulder_drive_20250708").crop(110.0, 270.0).without("gnss", (40.0, 60.0))
-    assert recording.gnss is not None
-    recording = replace(recording, gnss=pick_fixes(recording.gnss, np.arange(0, len(recording.gnss.t), 4)))
+    recording = thin_fixes(recording, 4)
     assert recording.gnss is not None
     t = recording.gnss.t - recording.start
     first, second = (t > 3.0) & (t < 19.5), (t > 20.5) & (t < 70.5)
@@ -437,9 +435,7 @@ def test_reflections_that_follow_each_other_are_left_out(shared_data: Path) -> N
 def test_positions_and_velocities_that_drift_together() -> None:
     """Simulated, a fix every three seconds: for seven minutes, a filter without wheels follows them 420 m away."""
     made = simulate("ushaq", 0, rate=20.0, fault="growing", growth_in_velocity=True)
-    recording = made.recording.crop(500.0, 1900.0)
-    assert recording.gnss is not None
-    recording = replace(recording, gnss=pick_fixes(recording.gnss, np.arange(0, len(recording.gnss.t), 3)))
+    recording = thin_fixes(made.recording.crop(500.0, 1900.0), 3)
     assert recording.gnss is not None
     wrong = (recording.gnss.t > FAULTS[0][0]) & (recording.gnss.t <= FAULTS[0][1])
     found = run(recording, parse_settings({"vehicle": {"nhc": False}}), ("rts",))["rts"]
@@ -450,14 +446,14 @@ def test_positions_and_velocities_that_drift_together() -> None:
 
 def test_a_drift_is_dated_to_the_fix(shared_data: Path) -> None:
     """Of positions and velocities, while nothing but a car's IMU contradicts it."""
-    recording = read(shared_data / "tokyo_20201105").without("odometer").crop(300.0, 700.0)
+    recording = thin_fixes(read(shared_data / "tokyo_20201105").without("odometer").crop(380.0, 640.0), 5)
     assert recording.gnss is not None
     t, rate = recording.gnss.t - recording.start, np.array([0.7, 0.7, 0.0])
-    bad = (t > 150.0) & (t <= 270.0)
-    wrong = moved(recording, bad, np.outer(t[bad] - 150.0, rate))
+    bad = (t > 70.0) & (t <= 190.0)
+    wrong = moved(recording, bad, np.outer(t[bad] - 70.0, rate))
     assert wrong.gnss is not None
     assert wrong.gnss.v is not None
-    faster = (wrong.gnss.velocity_t - recording.start > 150.0) & (wrong.gnss.velocity_t - recording.start <= 270.0)
+    faster = (wrong.gnss.velocity_t - recording.start > 70.0) & (wrong.gnss.velocity_t - recording.start <= 190.0)
     wrong = replace(wrong, gnss=replace(wrong.gnss, v=wrong.gnss.v + np.outer(faster, rate)))
     found = run(wrong, parse_settings({"vehicle": {"nhc": False}}), ("rts",))["rts"]
     out = left_out(found, wrong)

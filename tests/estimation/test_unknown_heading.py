@@ -96,7 +96,7 @@ def test_a_walk_of_three_metres_tells_its_heading(shared_data: Path) -> None:
 
 def test_noise_of_an_imu_at_rest_is_no_scale_error() -> None:
     """Simulated: the noise that a scale error would multiply draws it to where it explains the noise."""
-    rate, seconds, rng = 10.0, 3000.0, default_rng(3)
+    rate, seconds, rng = 10.0, 1500.0, default_rng(3)
     n = int(rate * seconds)
     noise = ImuNoise(gyro_noise_density=2e-4, accel_noise_density=2e-3, gyro_bias_walk=1e-7, accel_bias_walk=1e-6)
     gravity = np.array([-0.22, 0.6, 9.77])

@@ -374,7 +374,8 @@ def _improve_time(figures: Components, chain: ParameterChain, observed: Array, l
     value -= 0.5 * np.sum(np.log(steady) + first / steady, axis=1)
     median = figures.prior_times[p.name]
     value -= 0.5 * (np.log(times / median) / TIME_WITHIN) ** 2
-    groups = {group for group, known in zip(p.noise_groups, observed, strict=True) if known}
+    # in their order: a sum of floats in that of a set is another in every process
+    groups = dict.fromkeys(group for group, known in zip(p.noise_groups, observed, strict=True) if known)
     for group in groups:
         m, s = figures.get_prior(group)
         value -= 0.5 * ((figures.log[group] + np.log(grown) - m) / s) ** 2
