@@ -128,10 +128,15 @@ def _fit(
         if np.linalg.norm(left) < _SETTLED:
             break
         R = rotation.exp(left) @ rotation.exp(np.array(one.rotation))
-        one = replace(one, rotation=tuple(rotation.log(R).tolist()))
-        if not _is_turn(one):
+        ahead = replace(one, rotation=tuple(rotation.log(R).tolist()))
+        if not _is_turn(ahead):
+            return ahead, other
+        more = begin(undo_remountings(recording, (*found, ahead)), before=other)
+        gained = more.log_evidence - other.log_evidence
+        if gained > 0.0:
+            one, other = ahead, more
+        if gained < other.gained_by_chance:
             break
-        other = begin(undo_remountings(recording, (*found, one)), before=other)
     return one, other
 
 
@@ -153,10 +158,7 @@ def _find_changes(begun: Begun) -> tuple[Remounting, ...]:
     if outstanding < _OUTSTANDING or largest < _LEAST:
         return ()
     n = _MEANS[0]
-    before, after = (
-        _project(some.sum(axis=0)) for some in (mountings[1][best - n : best], mountings[1][best : best + n])
-    )
-    rotation_vector = rotation.log(before.T @ after)
+    (_, as_found), (before, rotation_vector) = (_compare_means(one, best, n) for one in mountings)
     imu, bias = begun.recording.imu, np.median(states.bg, axis=0)
     rows = np.flatnonzero((imu.t > max(t[best - 1] - _SEARCHED, problem.t[0])) & (imu.t <= t[best] + _SEARCHED))
     at = int(np.searchsorted(problem.t, imu.t[rows[0]], side="right")) - 1
@@ -174,6 +176,12 @@ def _find_changes(begun: Begun) -> tuple[Remounting, ...]:
     if done[behind[first]] - done[first] < _MOSTLY:
         return ()
     begin, end = a - beyond, b + beyond
+    ends = np.searchsorted(problem.t, (begin, end)).clip(0, len(problem.t) - 1)
+    by, found = (some[ends[0]].T @ some[ends[1]] for some in (by_gyro, states.R_nb))
+    # the change that the estimate shows, with what it takes for an error of the gyro meanwhile: nearly none where the
+    # gyro's bias changes for longer
+    if np.linalg.norm(rotation.log(by @ found.T @ rotation.exp(as_found))) < _MOSTLY * np.linalg.norm(rotation_vector):
+        return ()
     angle, k = _measure_changes(mountings[1], n)
     sigma = float(np.median(angle[np.abs(k - best) > n])) / _MEDIAN
     by_rows = _turn_by_rows(imu, bias, times, R_nb, (begin, end), rotation_vector)
@@ -203,6 +211,12 @@ def _measure_changes(mounting: Array, n: int) -> tuple[Array, Array]:
     k = np.arange(n, len(mounting) - n + 1)
     before, after = _project(sums[k] - sums[k - n]), _project(sums[k + n] - sums[k])
     return np.linalg.norm(rotation.log(np.swapaxes(before, -1, -2) @ after), axis=1), k
+
+
+def _compare_means(mounting: Array, best: int, n: int) -> tuple[Array, Array]:
+    """The mean (3, 3) of n mountings before one, and the rotation vector (3,), rad, to that of n from there on."""
+    before, after = (_project(some.sum(axis=0)) for some in (mounting[best - n : best], mounting[best : best + n]))
+    return before, rotation.log(before.T @ after)
 
 
 def _find_largest(mounting: Array, n: int) -> tuple[float, int, float]:
