@@ -120,7 +120,7 @@ CONSTANTS = (
         "LINEAR_ATTITUDE",
         "rad: half its square is the share of a vector that linearising loses",
     ),
-    Constant("graphnav.estimation.unknown_heading", "_PASSES", "computing: passes from each heading", 2.0, whole=True),
+    Constant("graphnav.estimation.solvers.ekf", "_PASSES", "computing: passes about points", 2.0, whole=True),
     Constant("graphnav.estimation.noise_search", "_MOST_WRONG", "the larger part"),
     Constant(
         "graphnav.estimation.relinearisation",

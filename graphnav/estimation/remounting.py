@@ -43,7 +43,7 @@ _BEGUN, _DONE = 0.2, 0.8  # shares of the turn by which its times are found
 _BEYOND = 0.75  # of the time between these, before and after: the rest, and slow ends
 _SIGMAS = 3.0  # that a turn is larger than
 _LONGEST = 4.0  # s that it takes
-_MOSTLY = 0.5  # of the change, that is to come about within these
+_MOSTLY = 0.5  # of the change: what comes about in that time, what the estimate shows, what two measures share
 _RATE = 0.5  # s beside it in which the vehicle's turn rate is measured
 _MEDIAN = 1.538  # of the length of a vector of three standard normal numbers
 _SEARCHED = 10.0  # s about the keyframes between which it is
@@ -161,36 +161,41 @@ def _find_changes(begun: Begun) -> tuple[Remounting, ...]:
     (_, as_found), (before, rotation_vector) = (_compare_means(one, best, n) for one in mountings)
     imu, bias = begun.recording.imu, np.median(states.bg, axis=0)
     rows = np.flatnonzero((imu.t > max(t[best - 1] - _SEARCHED, problem.t[0])) & (imu.t <= t[best] + _SEARCHED))
-    at = int(np.searchsorted(problem.t, imu.t[rows[0]], side="right")) - 1
-    steps = rotation.exp((imu.gyro[rows] - bias) * np.diff(imu.t[rows], prepend=problem.t[at])[:, None])
+    times, at = imu.t[rows], int(np.searchsorted(problem.t, imu.t[rows[0]], side="right")) - 1
+    steps = rotation.exp((imu.gyro[rows] - bias) * np.diff(times, prepend=problem.t[at])[:, None])
     R_nb = by_gyro[at] @ multiply_up(steps[:, None])[1:, 0]
-    course = np.stack([np.interp(imu.t[rows], t, x) for x in v.T], -1)
+    course = np.stack([np.interp(times, t, x) for x in v.T], -1)
     done = rotation.log(before.T @ _relate(course, R_nb)) @ rotation_vector / (rotation_vector @ rotation_vector)
-    times = imu.t[rows]
-    behind = np.minimum(np.searchsorted(times, times + _LONGEST), len(rows) - 1)
-    first = int(np.argmax(done[behind] - done))
-    part = slice(first, behind[first] + 1)
-    share = (done[part] - done[first]) / (done[behind[first]] - done[first])
-    a, b = (float(times[part][np.argmax(share > some)]) for some in (_BEGUN, _DONE))
-    beyond = _BEYOND * (b - a)
-    if done[behind[first]] - done[first] < _MOSTLY:
+    if (span := _find_span(times, done)) is None:
         return ()
-    begin, end = a - beyond, b + beyond
-    ends = np.searchsorted(problem.t, (begin, end)).clip(0, len(problem.t) - 1)
+    ends = np.searchsorted(problem.t, span).clip(0, len(problem.t) - 1)
     by, found = (some[ends[0]].T @ some[ends[1]] for some in (by_gyro, states.R_nb))
     # the change that the estimate shows, with what it takes for an error of the gyro meanwhile: nearly none where the
     # gyro's bias changes for longer
     if np.linalg.norm(rotation.log(by @ found.T @ rotation.exp(as_found))) < _MOSTLY * np.linalg.norm(rotation_vector):
         return ()
-    angle, k = _measure_changes(mountings[1], n)
-    sigma = float(np.median(angle[np.abs(k - best) > n])) / _MEDIAN
-    by_rows = _turn_by_rows(imu, bias, times, R_nb, (begin, end), rotation_vector)
+    by_rows = _turn_by_rows(imu, bias, times, R_nb, span, rotation_vector)
     if np.linalg.norm(by_rows) < _LEAST:  # as where a vehicle backs out: its course changes, and no gyro says so
         return ()
+    angle, k = _measure_changes(mountings[1], n)
+    sigma = float(np.median(angle[np.abs(k - best) > n])) / _MEDIAN
     apart = rotation.log(rotation.exp(-by_rows) @ rotation.exp(rotation_vector))
     mostly = np.linalg.norm(apart) < _MOSTLY * np.linalg.norm(rotation_vector)  # or else the vehicle turned as well
     vectors = (by_rows, rotation_vector) if mostly else (rotation_vector,)
-    return tuple(Remounting(begin, end, tuple(one.tolist()), sigma) for one in vectors)
+    return tuple(Remounting(*span, tuple(one.tolist()), sigma) for one in vectors)
+
+
+def _find_span(times: Array, done: Array) -> tuple[float, float] | None:
+    """When the device was turned, s, by the share of it that was done at each of some times; None if not at once."""
+    behind = np.minimum(np.searchsorted(times, times + _LONGEST), len(times) - 1)
+    first = int(np.argmax(done[behind] - done))
+    whole = done[behind[first]] - done[first]
+    if whole < _MOSTLY:
+        return None
+    part = slice(first, behind[first] + 1)
+    begin, end = (float(times[part][np.argmax(done[part] - done[first] > share * whole)]) for share in (_BEGUN, _DONE))
+    beyond = _BEYOND * (end - begin)
+    return begin - beyond, end + beyond
 
 
 def _turn_by_rows(imu: Imu, bias: Array, times: Array, R_nb: Array, span: tuple[float, float], near: Array) -> Array:

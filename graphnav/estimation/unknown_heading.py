@@ -21,13 +21,12 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import BREAKDOWN
-from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.ekf import ekf, smooth_repeatedly
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, SmootherPass, are_near
+from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, SmootherPass
 from graphnav.estimation.solvers.rts import smooth_backward
 
 _HEADINGS = int(np.ceil(np.pi / LINEAR_ATTITUDE))  # two sigmas apart, their sum is even to a part in a hundred
-_PASSES = 4  # about the points of the one before, until attitudes stay
 
 
 def choose_heading(problem: Problem, passes: Counter[str]) -> tuple[Problem, bool]:
@@ -82,13 +81,7 @@ def _solve_each_heading(
         other = _start_from(problem, float(turn))
         with contextlib.suppress(*BREAKDOWN):
             about = Points(_turn(first.states, problem, float(turn)), first.values)
-            for _ in range(_PASSES):
-                forward = refilter(other, about)
-                smoothed, before = smooth_backward(other, forward), about
-                passes.update(filter=1, smoother=1)
-                if are_near(smoothed, before):
-                    break
-                about = smoothed
+            forward, smoothed, _ = smooth_repeatedly(other, about, passes)
             if np.isfinite(evidence := float(np.sum(forward.log_likelihood))):
                 yield float(turn), evidence, smoothed
 

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Collection
 from functools import partial
 from typing import Any
@@ -60,7 +61,7 @@ from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import STAYS, StretchFilter
 from graphnav.imu.dynamics import SCALE
 
-_PASSES = 4  # passes of the opening, each about the points of the one before
+_PASSES = 4  # each about the points of the one before
 
 
 def ekf(
@@ -151,13 +152,38 @@ class Comparison:
         return stack
 
 
+def smooth_repeatedly(
+    problem: Problem, about: Points, passes: Counter[str] | None = None
+) -> tuple[ForwardRecord, SmootherPass, bool]:
+    """Filter and smooth the first keyframes about points, and about what comes out, until attitudes converge.
+
+    Parameters
+    ----------
+    passes : counts those made.
+
+    Returns
+    -------
+    tuple[ForwardRecord, SmootherPass, bool]
+        The last passes, and whether attitudes converged.
+    """
+    for _ in range(_PASSES):
+        forward = refilter(problem, about)
+        smoothed, before = smooth_backward(problem, forward), about
+        if passes is not None:
+            passes.update(filter=1, smoother=1)
+        if are_near(smoothed, before):
+            return forward, smoothed, True
+        about = smoothed
+    return forward, smoothed, False
+
+
 def smooth_near(problem: Problem, about: Points, opening: float | None = None) -> SmootherPass:
     """Smooth a drive again near a known solution, after a change of figures or weights only.
 
-    Where attitudes do not stay, it is smoothed from the start as a filter would be, with `opening` as for `ekf`.
+    Where attitudes do not converge, it is smoothed from the start as a filter would be, with `opening` as for `ekf`.
     """
-    smoothed, stay = _smooth_first(problem, about)
-    return smoothed if stay else smooth_backward(problem, ekf(problem, opening=opening))
+    _, smoothed, converged = smooth_repeatedly(problem, about)
+    return smoothed if converged else smooth_backward(problem, ekf(problem, opening=opening))
 
 
 def _linearise_opening(problem: Problem, n: int, known: Points | None) -> Points:
@@ -165,7 +191,7 @@ def _linearise_opening(problem: Problem, n: int, known: Points | None) -> Points
 
     Of n only where those of more do not converge.
     """
-    first = about = _smooth_opening(problem, n)[0] if known is None else known.take(slice(n))
+    first = about = _smooth_opening(problem, n)[1] if known is None else known.take(slice(n))
     K, size = len(problem.t), n
     with contextlib.suppress(*BREAKDOWN):
         while size < K:
@@ -173,31 +199,24 @@ def _linearise_opening(problem: Problem, n: int, known: Points | None) -> Points
             linear = np.flatnonzero(2.0 * np.sqrt(variance[:, :3].max(axis=1)) <= LINEAR_ATTITUDE)
             if len(linear):
                 points = about.take(slice(n + linear[0]))
-                return points if known is not None or size == n else _smooth_first(problem, points)[0]
+                if known is None and size > n:
+                    _, points, converged = smooth_repeatedly(problem, points)
+                    return points if converged else first
+                return points
             size = min(2 * size, K)
             if known is not None:
                 about = known.take(slice(size))
             else:
-                about, converged = _smooth_opening(problem, size, about)
+                _, about, converged = _smooth_opening(problem, size, about)
                 if not converged:
                     return first
         return about
     return first
 
 
-def _smooth_opening(problem: Problem, n: int, about: Points | None = None) -> tuple[SmootherPass, bool]:
-    """As `_smooth_first` of the first n keyframes, with points for some of these."""
-    return _smooth_first(problem, smooth_backward(problem, _run_forward(problem, n, about)))
-
-
-def _smooth_first(problem: Problem, about: Points) -> tuple[SmootherPass, bool]:
-    """Smooth the first keyframes about points, repeatedly until attitudes converge, and whether they do."""
-    for _ in range(_PASSES):
-        smoothed = smooth_backward(problem, refilter(problem, about))
-        if are_near(smoothed, about):
-            return smoothed, True
-        about = smoothed
-    return smoothed, False
+def _smooth_opening(problem: Problem, n: int, about: Points | None = None) -> tuple[ForwardRecord, SmootherPass, bool]:
+    """As `smooth_repeatedly` of the first n keyframes, with points for some of these."""
+    return smooth_repeatedly(problem, smooth_backward(problem, _run_forward(problem, n, about)))
 
 
 def _run_forward(
