@@ -98,6 +98,10 @@ class Prepared:
         """Whether the stated start is so far from the one found that a filter from there diverges for a while."""
         return has_diverged(self.aligned, self.start)
 
+    def drop_covariances(self) -> Prepared:
+        """The same without covariances and gains, which are nearly all of its memory."""
+        return replace(self, forward=self.forward.drop_covariances(), smoothed=self.smoothed.drop_covariances())
+
     def estimate_parameters(self) -> tuple[Problem, Array, Array]:
         """The problem, its parameters (D-15,) at the start and their covariance."""
         return self.problem, self.smoothed.values[0], self.smoothed.P[0][DIM:, DIM:]
