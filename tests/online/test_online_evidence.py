@@ -54,12 +54,13 @@ def test_what_fills_a_gap_of_the_imu_is_not_taken_for_a_fault_of_the_fixes_behin
     assert not left_out
 
 
-def test_wrong_fixes_are_found_where_the_imu_loses_single_rows() -> None:
-    """Several a second, as a motorbike's logger does: what is filled in for one explains no fix that is off by 30 m."""
+@pytest.mark.parametrize(("every", "lost"), [(13, 1), (100, 50)])
+def test_wrong_fixes_are_found_where_the_imu_loses_rows(every: int, lost: int) -> None:
+    """Several a second, as a motorbike's logger does, or half a second: what is filled in explains no 30 m."""
     recording = load("kitti").crop(309.8, 348.8)
     imu, gnss = recording.imu, recording.gnss
     assert gnss is not None
-    kept = np.arange(len(imu.t)) % 13 > 0
+    kept = np.arange(len(imu.t)) % every >= lost
     imu = replace(imu, t=imu.t[kept], gyro=imu.gyro[kept], accel=imu.accel[kept])
     frame, off = LocalFrame(gnss.llh[0]), (gnss.t > recording.start + 36.0) & (gnss.t < recording.start + 38.0)
     gnss = replace(gnss, llh=frame.to_llh(frame.from_llh(gnss.llh) + off[:, None] * np.array([10.0, 30.0, 0.0])))
