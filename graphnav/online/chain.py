@@ -233,21 +233,24 @@ class Chain:
     def _may_be_gap(self, t: float, tests: Watch) -> bool:
         """Whether a keyframe is behind gaps of the IMU with so few fixes since that what was filled in, as an error of
         place, velocity and attitude, explains them as well as a fault of theirs: in short ones nothing happens that is
-        as large as a fault, and a fix may be further off than the tyres can have moved a vehicle in them.
+        as large as a fault. Where fixes have told the place just before, a later one may be further off than the tyres
+        can have moved a vehicle in them; behind an outage attitudes have led it astray besides.
         """
         begin, end = self._gaps[(self._gaps[:, 1] <= t + SAME_TIME) & (self._gaps[:, 1] > t - PATIENCE)].T
         speed, fault, may_be = float(np.linalg.norm(self.window.newest.state.v)), self.window.stages[-1].fault, False
         for name, times in self.verdicts.times.items():
-            before = times.searchsorted(end)
-            since = times.searchsorted(t + SAME_TIME) - before
-            new = (since <= _FIXES_FOR_A_STATE) & ((before == 0) | (self.verdicts.used[name][before - 1] > 0.0))
-            if name in tests:
-                earlier = times[(times < t - SAME_TIME) & (self.verdicts.used[name] > 0.0)]  # these have told of places
-                unknown = t - np.maximum(begin, earlier[-1] if len(earlier) else -np.inf)  # s
-                most = tests.compute_shift(name, GRIP * (end - begin)[new], unknown[new])
-                may_be |= tests.would_seem_wrong(name, most, speed)
-                if fault is not None and fault[0] == name and self._measure_innovation(name) > most:
-                    return False
+            used, before = self.verdicts.used[name] > 0.0, times.searchsorted(end)
+            here = int(times.searchsorted(t + SAME_TIME))
+            new = (here - before <= _FIXES_FOR_A_STATE) & ((before == 0) | used[before - 1])
+            if name not in tests:
+                continue
+            known = times[: here - 1][used[: here - 1]][-1:]  # the last that has told the place
+            since = t - np.maximum(begin[new], known if len(known) else -np.inf)
+            most = tests.compute_shift(name, GRIP * (end - begin)[new], since)
+            may_be |= tests.would_seem_wrong(name, most, speed)
+            near = len(known) and t - known[0] < (_FIXES_FOR_A_STATE + 0.5) * np.median(np.diff(times))
+            if near and fault is not None and fault[0] == name and self._measure_innovation(name) > most:
+                return False
         return may_be
 
     def _measure_innovation(self, name: str) -> float:

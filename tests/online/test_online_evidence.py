@@ -71,6 +71,26 @@ def test_wrong_fixes_are_found_where_the_imu_loses_rows(every: int, lost: int) -
     assert (fault.kind, fault.t_start, fault.t_end) == ("gnss_position", gnss.t[off][0], gnss.t[off][-1])
 
 
+def test_right_fixes_are_used_again_soon_that_wrong_ones_shut_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two wrong ones lead heading and speed astray."""
+    recording = load("kitti").crop(309.8, 365.8)
+    gnss = recording.gnss
+    assert gnss is not None
+    frame, off = LocalFrame(gnss.llh[0]), (gnss.t > recording.start + 36.0) & (gnss.t < recording.start + 38.0)
+    wrong = replace(gnss, llh=frame.to_llh(frame.from_llh(gnss.llh) + off[:, None] * np.array([10.0, 30.0, 0.0])))
+    until, find = gnss.t[off][-1], Watch.find_onset
+    monkeypatch.setattr(Watch, "find_onset", lambda self, name, t, *a: (None, find(self, name, t, *a))[int(t > until)])
+    online, shut_out = Online(drop_rows(recording), parse_settings({"vehicle": {"nhc": True}})), 0
+    for row in list_rows(replace(recording, gnss=wrong))[1]:
+        online.add(row)
+        if online.tracker is not None:
+            shut_out = max([shut_out, *(fault.count for fault in online.excluded if fault.t_start > until)])
+    online.finish()
+    (fault,) = online.excluded
+    assert shut_out >= 4
+    assert (fault.t_start, fault.t_end) == (gnss.t[off][0], until)
+
+
 @pytest.mark.parametrize("engine", ["window", "isam2"])
 def test_sigmas_at_once_are_true_behind_a_gap_of_the_imu_in_an_outage(engine: str) -> None:
     """A second and a half in a turn: whole Gauss-Newton steps swing by degrees, and each makes sigmas smaller."""
