@@ -206,7 +206,7 @@ class Chain:
             turn = max(turn, self._push(problem, k, ahead))
             ahead = None
             fault, tests = self.window.stages[-1].fault, self.window.newest.tests
-            if tests is not None and self._follows_gap(float(problem.t[k]), tests):
+            if tests is not None and self._may_be_gap(float(problem.t[k]), tests):
                 self.window.watch(tests.forget_onsets())
                 fault = None
             if fault is not None and problem.t[k] > self.judged + SAME_TIME:
@@ -230,21 +230,33 @@ class Chain:
         gaps = gaps[np.argsort(gaps[:, 1], kind="stable")]
         self._gaps = gaps[np.append(np.diff(gaps[:, 1]) > SAME_TIME, True)[: len(gaps)]]
 
-    def _follows_gap(self, t: float, tests: Watch) -> bool:
-        """Whether a keyframe is behind a gap of the IMU with so few fixes since that what was filled in, as an error of
-        place, velocity and attitude, explains them as well as a fault of theirs; in a short one nothing happens that is
-        as large as a fault.
+    def _may_be_gap(self, t: float, tests: Watch) -> bool:
+        """Whether a keyframe is behind gaps of the IMU with so few fixes since that what was filled in, as an error of
+        place, velocity and attitude, explains them as well as a fault of theirs: in short ones nothing happens that is
+        as large as a fault. Where fixes have told the place just before, a later one may be further off than the tyres
+        can have moved a vehicle in them; behind an outage attitudes have led it astray besides.
         """
         begin, end = self._gaps[(self._gaps[:, 1] <= t + SAME_TIME) & (self._gaps[:, 1] > t - PATIENCE)].T
-        speed = float(np.linalg.norm(self.window.newest.state.v))
+        speed, fault, may_be = float(np.linalg.norm(self.window.newest.state.v)), self.window.stages[-1].fault, False
         for name, times in self.verdicts.times.items():
-            before = times.searchsorted(end)
-            since = times.searchsorted(t + SAME_TIME) - before
-            new = (since <= _FIXES_FOR_A_STATE) & ((before == 0) | (self.verdicts.used[name][before - 1] > 0.0))
-            moved = GRIP * (end - begin)[new]  # m/s at most
-            if new.any() and name in tests and tests.would_seem_wrong(name, moved, (t - begin)[new], speed):
-                return True
-        return False
+            used, before = self.verdicts.used[name] > 0.0, times.searchsorted(end)
+            here = int(times.searchsorted(t + SAME_TIME))
+            new = (here - before <= _FIXES_FOR_A_STATE) & ((before == 0) | used[before - 1])
+            if name not in tests:
+                continue
+            known = times[: here - 1][used[: here - 1]][-1:]  # the last that has told the place
+            since = t - np.maximum(begin[new], known if len(known) else -np.inf)
+            most = tests.compute_shift(name, GRIP * (end - begin)[new], since)
+            may_be |= tests.would_seem_wrong(name, most, speed)
+            near = len(known) and t - known[0] < (_FIXES_FOR_A_STATE + 0.5) * np.median(np.diff(times))
+            if near and fault is not None and fault[0] == name and self._measure_innovation(name) > most:
+                return False
+        return may_be
+
+    def _measure_innovation(self, name: str) -> float:
+        """How far the newest keyframe's fixes of a kind are from their prediction, m or m/s."""
+        rows = (one for one in self.window.stages[-1].measured if one.name == name)
+        return max(float(np.linalg.norm(one.b * one.sigma, axis=1).max()) for one in rows)
 
     def _push(self, problem: Problem, k: int, ahead: Predicted | None) -> float:
         place, nodes = self._place(problem, k)

@@ -6,7 +6,8 @@ otherwise than detectors and tests did, a second tracker processes the unsettled
 Stops are contradicted as `graphnav.estimation.noise.false_stops` has it: four seconds after a stop began, and whenever
 it is twice as old, up to half of the lag. Spans of fixes that the filter's tests have left out since evidence decided
 last are explained as `graphnav.estimation.noise.decision` has it, once they are half of the lag old and over for a
-quarter, or three quarters old.
+quarter, or three quarters old. Where they last, what was used before may be wrong instead, and the filter has nothing
+but the IMU: that is asked as of stops, and what is decided may be asked again.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from graphnav.estimation.contradictions import free
 from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.faults.watch import FALSE_ALARM
 from graphnav.estimation.noise.apply import apply_noise
-from graphnav.estimation.noise.decision import explain
+from graphnav.estimation.noise.decision import Decision, explain
 from graphnav.estimation.noise.estimate import NoiseEstimate
 from graphnav.estimation.noise.exclusion import add_outliers
 from graphnav.estimation.noise.explanations import FIXES
@@ -38,7 +39,7 @@ from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_row_moments
 from graphnav.estimation.noise.outliers import compute_row_costs, list_reduced
 from graphnav.estimation.noise.spans import Span, drop_within, join, join_faults, list_distinct, mask_times, trim
-from graphnav.estimation.noise.suspects import predict_left_out
+from graphnav.estimation.noise.suspects import find_suspects, predict_left_out
 from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
@@ -83,6 +84,7 @@ class WindowTask:
     noise: NoiseModel
     stationary: Array  # (M, 2) s
     suspects: list[Span]  # s
+    lasting: list[Span]  # s, those of them that are not over
     wrong: Mapping[str, tuple[Span, ...]]  # s, that the tests have left out
 
     def run(self) -> Judgement:
@@ -101,7 +103,25 @@ class WindowTask:
         return Judgement(false, self._explain(noise, false) if self.suspects else None)
 
     def _explain(self, noise: NoiseModel, false: Array) -> NoiseModel:
-        """What is wrong in the suspected spans, or in the part of them that fixes disagree with, by the noise model."""
+        """What is wrong in the suspected spans, or in the part of them that fixes disagree with, by the noise model.
+
+        Where spans last, also about a solution that uses them, what the tests find by that: points that have drifted
+        for want of fixes make right ones unlikely.
+        """
+        decisions = self._decide(noise, false, self.suspects)
+        if self.lasting:
+            kept = {
+                name: tuple(span for span in some if not mask_times(np.array(span), self.lasting).any())
+                for name, some in noise.excluded.items()
+            }
+            left = join(span for some in kept.values() for span in some if span[1] > self.times[0])
+            decisions += self._decide(replace(noise, excluded=kept), false, left, tested=True)
+        return max(decisions, key=lambda one: one.log_evidence).noise
+
+    def _decide(self, noise: NoiseModel, false: Array, suspects: list[Span], tested: bool = False) -> list[Decision]:
+        """Decisions on suspected spans, and parts of them, about the solution with a noise model; with `tested` also on
+        those that the tests find by it.
+        """
         base, used, smoothed, _ = self._solve(noise, True, None, false)
         noise = weigh_tails(noise, used, smoothed)
         weighed = apply_noise(base, noise)
@@ -111,9 +131,10 @@ class WindowTask:
         errors = predict_left_out(weighed, found)
         # what is left out beside the suspects, such as single fixes, is an outlier
         found = add_outliers(found, errors, join(span for some in noise.excluded.values() for span in some))
-        candidates = list_distinct(self.suspects, trim(self.suspects, errors), trim(self.suspects, errors, FALSE_ALARM))
-        decisions = (explain(base, found, some) for some in candidates)
-        return max(decisions, key=lambda one: one.log_evidence).noise
+        if tested:
+            suspects = join([*suspects, *find_suspects(base, noise, found)])
+        candidates = list_distinct(suspects, trim(suspects, errors), trim(suspects, errors, FALSE_ALARM))
+        return [explain(base, found, some) for some in candidates]
 
     def _solve(
         self, noise: NoiseModel, standing: bool, _: object, false: Array
@@ -157,6 +178,8 @@ class WindowJudge:
         self._begun = self._done = -np.inf  # s, the newest keyframe of the last judgement, and of the last result
         # s, up to where spans that tests have left out were judged, and will be once the running judgement is done
         self._explained = self._explains = -np.inf
+        self._asked = -np.inf  # s, the newest keyframe when fixes were judged last
+        self._lasting = False  # whether only because some last, and these can be judged again
         self._running: BackgroundEstimation | None = None
 
     def holds(self, tracker: Tracker) -> bool:
@@ -164,10 +187,16 @@ class WindowJudge:
         stops = bool(np.any(tracker.stops[:, 0] > self._done - _FIRST))
         return _can_judge(tracker) and (stops or bool(self._list_old(tracker, _OLDEST)))
 
-    def _list_old(self, tracker: Tracker, age: float) -> list[ExcludedSpan]:
-        """Spans that tests have left out, of such an age in lags, which have not been judged."""
+    def _list_old(self, tracker: Tracker, age: float, over: float = np.inf) -> list[ExcludedSpan]:
+        """Spans that tests have left out, of such an age in lags, which have not been judged: not at all, or not to
+        their ends, which are before a time, s.
+        """
         since, until = max(self._explained, tracker.judged), tracker.newest - age * tracker.settings.solver.lag
-        return [f for f in _list_tested(tracker) if since < f.t_start <= until]
+        return [
+            f
+            for f in _list_tested(tracker)
+            if f.t_start <= until and (f.t_start > since if over == np.inf else since < f.t_end <= over)
+        ]
 
     def look(self, sensors: Sensors, tracker: Tracker, last: bool = False) -> CatchUp | None:
         """Start to judge what is due of a tracker, or take the result; returns the tracker without what is wrong and
@@ -181,28 +210,34 @@ class WindowJudge:
         if self._running is None:
             age, before = now - tracker.stops[:, 0], np.maximum(self._begun - tracker.stops[:, 0], 0.0)
             due = (before < _OLDEST * lag) & ((age >= np.maximum(2.0 * before, _FIRST)) | (last and now > self._begun))
-            youngest = _OVER if last else _OLDEST
-            old = self._list_old(tracker, youngest)
-            over = [f for f in old if last or f.t_end <= now - _OVER * lag] or self._list_old(tracker, _OLDEST + _OVER)
-            if not _can_judge(tracker) or not (due.any() or over):
+            youngest, until = (_OVER, now) if last else (_OLDEST, now - _OVER * lag)
+            over = self._list_old(tracker, youngest, until) or self._list_old(tracker, _OLDEST + _OVER)
+            shut = not over and any(_is_due(f, now, self._asked) for f in _list_tested(tracker, lasting=True))
+            if not _can_judge(tracker) or not (due.any() or over or shut):
                 return None
-            task = _describe(sensors, tracker, bool(due.any()), bool(over))
+            task = _describe(sensors, tracker, bool(due.any()), bool(over) or shut)
             self._running = BackgroundEstimation(task, now + _THINKING * limit_thought(lag))
             self._begun = now
+            if task.suspects:
+                self._asked = now
             young = [f.t_start - SAME_TIME for f in _list_tested(tracker) if f.t_start > now - youngest * lag]
-            self._explains = min([now - _OVER * lag, *young])
+            self._explains = float(task.times[-1]) if shut else min([now - _OVER * lag, *young])
+            self._lasting = shut
         if not last and now < self._running.due:
             return None
         running, self._running, self._done = self._running, None, self._begun
         until = self._explains
-        if running.task.suspects:
+        known = running.task.noise.figures == tracker.noise.figures  # else by figures that are no longer in use
+        if not known:
+            self._asked = -np.inf
+        elif running.task.suspects and not self._lasting:
             self._explained = until
         try:
             found = running.wait()
         except BREAKDOWN:
             return None
         noise, judged = tracker.noise, -np.inf
-        if found.decided is not None and until > tracker.judged:
+        if found.decided is not None and known and until > tracker.judged:
             excluded = {n: tuple(s for s in spans if s[0] <= until) for n, spans in found.decided.excluded.items()}
             excluded = join_excluded(noise.excluded, excluded)
             if not _are_alike(tracker, excluded, until):
@@ -227,9 +262,16 @@ def _are_alike(tracker: Tracker, excluded: Mapping[str, tuple[Span, ...]], until
     )
 
 
-def _list_tested(tracker: Tracker) -> list[ExcludedSpan]:
-    """Spans of fixes that tests have left out; single ones make no difference."""
-    return [f for f in tracker.verdicts.list_faults() if f.count > 1 and f.kind in FIXES]
+def _list_tested(tracker: Tracker, lasting: bool = False) -> list[ExcludedSpan]:
+    """Spans of fixes that tests have left out, or those that last; single ones make no difference."""
+    newest = {name: t[-1] for name, t in tracker.verdicts.times.items() if len(t)}
+    found = (f for f in tracker.verdicts.list_faults() if f.count > 1 and f.kind in FIXES)
+    return [f for f in found if not lasting or f.t_end == newest[f.kind]]
+
+
+def _is_due(fault: ExcludedSpan, now: float, asked: float) -> bool:
+    """Whether a span is to be judged now, s, if spans were last at another time: early, and when it is twice as old."""
+    return now - fault.t_start >= max(2.0 * (asked - fault.t_start), _FIRST)
 
 
 def _list_spans(faults: Iterable[ExcludedSpan]) -> dict[str, tuple[Span, ...]]:
@@ -281,5 +323,6 @@ def _describe(sensors: Sensors, tracker: Tracker, stops: bool, fixes: bool) -> W
         noise,
         tracker.stops,
         join_faults(f for f in left_out if f.t_end > times[0] and f.kind in FIXES) if fixes else [],
+        join_faults(_list_tested(tracker, lasting=True)) if fixes else [],
         _list_spans(left_out),
     )

@@ -54,12 +54,13 @@ def test_what_fills_a_gap_of_the_imu_is_not_taken_for_a_fault_of_the_fixes_behin
     assert not left_out
 
 
-def test_wrong_fixes_are_found_where_the_imu_loses_single_rows() -> None:
-    """Several a second, as a motorbike's logger does: what is filled in for one explains no fix that is off by 30 m."""
+@pytest.mark.parametrize(("every", "lost"), [(13, 1), (100, 50)])
+def test_wrong_fixes_are_found_where_the_imu_loses_rows(every: int, lost: int) -> None:
+    """Several a second, as a motorbike's logger does, or half a second: what is filled in explains no 30 m."""
     recording = load("kitti").crop(309.8, 348.8)
     imu, gnss = recording.imu, recording.gnss
     assert gnss is not None
-    kept = np.arange(len(imu.t)) % 13 > 0
+    kept = np.arange(len(imu.t)) % every >= lost
     imu = replace(imu, t=imu.t[kept], gyro=imu.gyro[kept], accel=imu.accel[kept])
     frame, off = LocalFrame(gnss.llh[0]), (gnss.t > recording.start + 36.0) & (gnss.t < recording.start + 38.0)
     gnss = replace(gnss, llh=frame.to_llh(frame.from_llh(gnss.llh) + off[:, None] * np.array([10.0, 30.0, 0.0])))
@@ -68,6 +69,26 @@ def test_wrong_fixes_are_found_where_the_imu_loses_single_rows() -> None:
         online.add(row)
     (fault,) = online.excluded
     assert (fault.kind, fault.t_start, fault.t_end) == ("gnss_position", gnss.t[off][0], gnss.t[off][-1])
+
+
+def test_right_fixes_are_used_again_soon_that_wrong_ones_shut_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two wrong ones lead heading and speed astray."""
+    recording = load("kitti").crop(309.8, 365.8)
+    gnss = recording.gnss
+    assert gnss is not None
+    frame, off = LocalFrame(gnss.llh[0]), (gnss.t > recording.start + 36.0) & (gnss.t < recording.start + 38.0)
+    wrong = replace(gnss, llh=frame.to_llh(frame.from_llh(gnss.llh) + off[:, None] * np.array([10.0, 30.0, 0.0])))
+    until, find = gnss.t[off][-1], Watch.find_onset
+    monkeypatch.setattr(Watch, "find_onset", lambda self, name, t, *a: (None, find(self, name, t, *a))[int(t > until)])
+    online, shut_out = Online(drop_rows(recording), parse_settings({"vehicle": {"nhc": True}})), 0
+    for row in list_rows(replace(recording, gnss=wrong))[1]:
+        online.add(row)
+        if online.tracker is not None:
+            shut_out = max([shut_out, *(fault.count for fault in online.excluded if fault.t_start > until)])
+    online.finish()
+    (fault,) = online.excluded
+    assert shut_out >= 4
+    assert (fault.t_start, fault.t_end) == (gnss.t[off][0], until)
 
 
 @pytest.mark.parametrize("engine", ["window", "isam2"])

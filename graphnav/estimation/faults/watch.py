@@ -366,10 +366,15 @@ class Watch:
         add_row(slots.memory, rho, Gamma, slots.L, slots.c, errors, T)
         return slots.find(t, errors, T, slots.typical_sigmas.factor, speed)
 
-    def would_seem_wrong(self, name: str, dv: Array, since: Array, speed: float) -> bool:
-        """Whether fixes would be off by as much as by a fault where the velocity is off by dv (n,) m/s since (n,) s."""
+    def compute_shift(self, name: str, dv: Array, since: Array) -> float:
+        """By how much fixes seem off, m or m/s, where the velocity has changed by dv (n,) m/s since (n,) s, each time
+        in a direction of its own.
+        """
+        return float(np.linalg.norm(dv * since if self._slots[name].fix_of == "p" else dv))
+
+    def would_seem_wrong(self, name: str, away: float, speed: float) -> bool:
+        """Whether fixes that are off by so much, m or m/s, would seem wrong."""
         slots = self._slots[name]
-        away = np.max(dv * since if slots.fix_of == "p" else dv)
         return bool(_are_large(np.full(slots.m, away), slots.typical_error, slots.fix_of, speed))
 
     def __contains__(self, name: str) -> bool:
