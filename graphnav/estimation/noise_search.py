@@ -206,31 +206,21 @@ def _start_without(
     if without is built:
         return built, found
     again = replace(found, stated=without.problem)
-    same = np.array_equal(without.problem.t, built.problem.t)
 
-    def estimate(
-        before: NoiseEstimate, near: tuple[Points, Problem] | None = None, known: NoiseEstimate | None = None
-    ) -> NoiseEstimate:
-        return estimate_noise(again.base, without.aligned.opening, before.noise, near, progress, known=known)
+    def estimate(near: tuple[Points, Problem] | None = None, known: NoiseEstimate | None = None) -> NoiseEstimate:
+        start, opening = found.estimate.noise, without.aligned.opening
+        return estimate_noise(again.base, opening, start, near, progress, known=known)
 
-    def go_on(before: NoiseEstimate) -> NoiseEstimate:
-        if not same:
-            return estimate(before)
+    if not np.array_equal(without.problem.t, built.problem.t):
+        best = estimate()
+    else:
         # the points known rest on the start before, and a filter from the new one may diverge: the likelier
-        near = estimate(before, before.get_linearisation(found.base))
-        try:
-            fresh = estimate(before, known=near)
-        except BREAKDOWN:
-            return near
-        best = max(near, fresh, key=lambda one: one.log_evidence)
-        return replace(best, passes=near.passes + fresh.passes)
-
-    best, rival = go_on(found.estimate), found.estimate.rival
-    total = found.estimate.passes + best.passes
-    if rival is not None:
-        rival = go_on(rival)
-        total = total + rival.passes
-    return without, replace(again, estimate=replace(best, rival=rival)).count(total)
+        best = near = estimate(found.estimate.get_linearisation(found.base))
+        with contextlib.suppress(*BREAKDOWN):
+            fresh = estimate(known=near)
+            likelier = max(near, fresh, key=lambda one: one.log_evidence)
+            best = replace(likelier, passes=near.passes + fresh.passes)
+    return without, replace(again, estimate=best).count(found.estimate.passes + best.passes)
 
 
 def _start_anew(
