@@ -17,14 +17,12 @@ from functools import partial
 
 import numpy as np
 
-from graphnav.core.errors import EstimationError
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE
 from graphnav.estimation.building import BuiltProblem, ProblemBuilder
 from graphnav.estimation.joint_estimate import (
     JointEstimate,
-    begin_jointly,
     estimate_as_stated,
     estimate_moved,
     free_contradicted,
@@ -47,8 +45,6 @@ from graphnav.estimation.solvers.linearise import Points
 Weigh = Callable[[Problem, Points], bool]
 
 Estimated = tuple[BuiltProblem, JointEstimate]  # a problem and the estimate on it
-
-_MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
 def begin_noise(builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None) -> Estimated:
@@ -172,30 +168,10 @@ def _find(builder: ProblemBuilder, begun: Estimated, progress: Progress | None) 
     """
     settings, built = builder.settings.gnss, begun[0]
     found = leave_out_jointly(begun[1], settings, built.aligned.opening, progress)
-    if found.excluded_share > _MOST_WRONG and built.aligned.until is not None:
-        with contextlib.suppress(EstimationError):  # no motion later on
-            built, found = _start_later(builder, begun, found, progress)
     if found.noise.excluded:
         built, found = _start_without(builder, built, found, progress)
     found = revise_jointly(found, settings, built.aligned.opening, progress)
     return _start_anew(builder, built, found) if found.freed else (built, found)
-
-
-def _start_later(
-    builder: ProblemBuilder, begun: Estimated, found: JointEstimate, progress: Progress | None
-) -> Estimated:
-    """The same with a start by the fixes behind those that the alignment used, if it contradicts fewer of them."""
-    settings, later = builder.settings.gnss, builder.build_later(begun[0])
-    other = begin_jointly(later.problem, settings, later.aligned.opening, progress)
-    passes = found.estimate.passes
-    # where all measurements agree no better with that start, it is not what is wrong
-    comparable = np.array_equal(later.problem.t, begun[0].problem.t)
-    if comparable and other.compute_evidence() <= begun[1].compute_evidence() + other.estimate.gained_by_chance:
-        return begun[0], found.count(passes + other.estimate.passes)
-    other = leave_out_jointly(other, settings, later.aligned.opening, progress)
-    passes = passes + other.estimate.passes
-    fewer = other.excluded_share < found.excluded_share
-    return (later, other.count(passes)) if fewer else (begun[0], found.count(passes))
 
 
 def _start_without(
