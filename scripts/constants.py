@@ -122,7 +122,6 @@ CONSTANTS = (
         "rad: half its square is the share of a vector that linearising loses",
     ),
     Constant("graphnav.estimation.solvers.ekf", "_PASSES", "computing: passes about points", 2.0, whole=True),
-    Constant("graphnav.estimation.noise_search", "_MOST_WRONG", "the larger part"),
     Constant(
         "graphnav.estimation.relinearisation",
         "_LINEAR",

@@ -25,7 +25,6 @@ from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detections, detect
 from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment import Alignment, align, use_known_heading
-from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.contradictions import use_freed
 from graphnav.estimation.fixing import split_carriers
 from graphnav.estimation.noise.left_out import drop_excluded
@@ -141,14 +140,6 @@ class ProblemBuilder:
         """The problem without the false stops, aligned again."""
         detections = built.detections.without(self.false_stops)
         return self.build(self.align(self.recording, detections.stationary), detections, parts=True)
-
-    def build_later(self, built: BuiltProblem) -> BuiltProblem:
-        """The problem with a start that is sought after the fixes used by the first alignment."""
-        gnss, until = self.recording.gnss, built.aligned.until
-        assert gnss is not None
-        assert until is not None
-        rest = replace(self.recording, gnss=pick_fixes(gnss, gnss.t > until))
-        return self.build(self.align(rest, built.detections.stationary), built.detections, parts=True)
 
     def build_without(self, built: BuiltProblem, noise: NoiseModel, parts: bool, anew: bool = False) -> BuiltProblem:
         """The problem with a start and stops that depend on no fix that a noise model excludes, and on no constant as

@@ -29,7 +29,6 @@ from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
-from graphnav.estimation.noise.left_out import compute_excluded_share
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, VarianceComponent
 from graphnav.estimation.noise.priors import get_prior
 from graphnav.estimation.noise.scales import are_scales_contradicted
@@ -59,11 +58,6 @@ class JointEstimate:
     def noise(self) -> NoiseModel:
         """The noise model with the freed constants."""
         return replace(self.estimate.noise, freed=self.freed)
-
-    @property
-    def excluded_share(self) -> float:
-        """Share of the fixes that are excluded."""
-        return compute_excluded_share(self.stated, self.estimate.noise)
 
     def compute_evidence(self) -> float:
         """The logarithm of the evidence of the measurements."""
@@ -98,18 +92,8 @@ def estimate_jointly(
     EstimationError
         If the filter breaks down.
     """
-    found = begin_jointly(stated, settings, opening, progress)
+    found = free_contradicted(estimate_as_stated(stated, opening, progress), settings, opening, progress)
     return leave_out_jointly(found, settings, opening, progress)
-
-
-def begin_jointly(
-    stated: Problem,
-    settings: GnssSettings,
-    opening: float | None = None,
-    progress: Progress | None = None,
-) -> JointEstimate:
-    """The same with all measurements; what is given is as for `estimate_jointly`."""
-    return free_contradicted(estimate_as_stated(stated, opening, progress), settings, opening, progress)
 
 
 def estimate_as_stated(

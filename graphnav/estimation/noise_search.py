@@ -17,14 +17,12 @@ from functools import partial
 
 import numpy as np
 
-from graphnav.core.errors import EstimationError
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE
 from graphnav.estimation.building import BuiltProblem, ProblemBuilder
 from graphnav.estimation.joint_estimate import (
     JointEstimate,
-    begin_jointly,
     estimate_as_stated,
     estimate_moved,
     free_contradicted,
@@ -47,8 +45,6 @@ from graphnav.estimation.solvers.linearise import Points
 Weigh = Callable[[Problem, Points], bool]
 
 Estimated = tuple[BuiltProblem, JointEstimate]  # a problem and the estimate on it
-
-_MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
 def begin_noise(builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None) -> Estimated:
@@ -172,30 +168,10 @@ def _find(builder: ProblemBuilder, begun: Estimated, progress: Progress | None) 
     """
     settings, built = builder.settings.gnss, begun[0]
     found = leave_out_jointly(begun[1], settings, built.aligned.opening, progress)
-    if found.excluded_share > _MOST_WRONG and built.aligned.until is not None:
-        with contextlib.suppress(EstimationError):  # no motion later on
-            built, found = _start_later(builder, begun, found, progress)
     if found.noise.excluded:
         built, found = _start_without(builder, built, found, progress)
     found = revise_jointly(found, settings, built.aligned.opening, progress)
     return _start_anew(builder, built, found) if found.freed else (built, found)
-
-
-def _start_later(
-    builder: ProblemBuilder, begun: Estimated, found: JointEstimate, progress: Progress | None
-) -> Estimated:
-    """The same with a start by the fixes behind those that the alignment used, if it contradicts fewer of them."""
-    settings, later = builder.settings.gnss, builder.build_later(begun[0])
-    other = begin_jointly(later.problem, settings, later.aligned.opening, progress)
-    passes = found.estimate.passes
-    # where all measurements agree no better with that start, it is not what is wrong
-    comparable = np.array_equal(later.problem.t, begun[0].problem.t)
-    if comparable and other.compute_evidence() <= begun[1].compute_evidence() + other.estimate.gained_by_chance:
-        return begun[0], found.count(passes + other.estimate.passes)
-    other = leave_out_jointly(other, settings, later.aligned.opening, progress)
-    passes = passes + other.estimate.passes
-    fewer = other.excluded_share < found.excluded_share
-    return (later, other.count(passes)) if fewer else (begun[0], found.count(passes))
 
 
 def _start_without(
@@ -206,31 +182,21 @@ def _start_without(
     if without is built:
         return built, found
     again = replace(found, stated=without.problem)
-    same = np.array_equal(without.problem.t, built.problem.t)
 
-    def estimate(
-        before: NoiseEstimate, near: tuple[Points, Problem] | None = None, known: NoiseEstimate | None = None
-    ) -> NoiseEstimate:
-        return estimate_noise(again.base, without.aligned.opening, before.noise, near, progress, known=known)
+    def estimate(near: tuple[Points, Problem] | None = None, known: NoiseEstimate | None = None) -> NoiseEstimate:
+        start, opening = found.estimate.noise, without.aligned.opening
+        return estimate_noise(again.base, opening, start, near, progress, known=known)
 
-    def go_on(before: NoiseEstimate) -> NoiseEstimate:
-        if not same:
-            return estimate(before)
+    if not np.array_equal(without.problem.t, built.problem.t):
+        best = estimate()
+    else:
         # the points known rest on the start before, and a filter from the new one may diverge: the likelier
-        near = estimate(before, before.get_linearisation(found.base))
-        try:
-            fresh = estimate(before, known=near)
-        except BREAKDOWN:
-            return near
-        best = max(near, fresh, key=lambda one: one.log_evidence)
-        return replace(best, passes=near.passes + fresh.passes)
-
-    best, rival = go_on(found.estimate), found.estimate.rival
-    total = found.estimate.passes + best.passes
-    if rival is not None:
-        rival = go_on(rival)
-        total = total + rival.passes
-    return without, replace(again, estimate=replace(best, rival=rival)).count(total)
+        best = near = estimate(found.estimate.get_linearisation(found.base))
+        with contextlib.suppress(*BREAKDOWN):
+            fresh = estimate(known=near)
+            likelier = max(near, fresh, key=lambda one: one.log_evidence)
+            best = replace(likelier, passes=near.passes + fresh.passes)
+    return without, replace(again, estimate=best).count(found.estimate.passes + best.passes)
 
 
 def _start_anew(

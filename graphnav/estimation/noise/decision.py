@@ -43,7 +43,6 @@ class Decision:
     passes: Counter[str] = field(default_factory=Counter)
     estimate: NoiseEstimate | None = None  # without what is suspected, by whose figures it is; with this noise, where
     # nothing is left out
-    rival: Decision | None = None  # the likeliest by spans as the tests found them, if this one is by segments
 
 
 def explain(

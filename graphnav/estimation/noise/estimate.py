@@ -65,7 +65,6 @@ class NoiseEstimate:
     log_evidence: float  # of the measurements, and prior: of the likelihood, rows of reduced weight have that of tails
     passes: Counter[str]  # over keyframes, of "filter" and "smoother"
     whole_evidence: float | None = None  # of all measurements, excluded ones included, where it was computed
-    rival: NoiseEstimate | None = None  # by another decision on what is wrong, nearly as likely
 
     @property
     def gained_by_chance(self) -> float:

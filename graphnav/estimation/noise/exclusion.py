@@ -26,20 +26,16 @@ once more, as the spans shrink to what is wrong, unless the figures lose more ev
 gain outside. If no fault is left, the estimate that uses all measurements and starts from these figures is a candidate.
 
 Segments. A filter follows an error that lasts, so the tests find its beginning, and its end as the beginning of
-another. So the ends of all suspected spans divide the drive into segments, and those that are wrong together by the
-evidence (`graphnav.estimation.faults.segments`) are one more set of spans, if one of them was not suspected. Two
-disturbances of the IMU make the fixes between them look displaced as well. So where segments are the likeliest, the
-likeliest of the other sets is estimated too, and stands unless segments are likelier in the end by more than figures
-gain by chance.
+another. So with the figures estimated without them the ends of all suspected spans divide the drive into segments, and
+those that are wrong together by the evidence (`graphnav.estimation.faults.segments`) are one more set of spans, if one
+of them was not suspected.
 
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
 are suspected instead, the same way, and the likeliest stands, of both and of the estimate with all measurements. Where
 that leaves other spans out, so are the fixes before these. An estimate without the fixes before that explains the rest
 no better than what stands has lost: those fixes agree with the latter, and would have to be explained as wrong.
-Figures bent by a fault find other segments wrong than those estimated without it: the segments that are wrong by the
-figures of what stands are suspected last. Which part of a drive is right is decided at the end
-(`graphnav.estimation.noise.rivals`).
+Which part of a drive is right is decided at the end (`graphnav.estimation.noise.rivals`).
 """
 
 from __future__ import annotations
@@ -120,33 +116,26 @@ def estimate_without_faults(
         return replace(best, passes=passes)
     best = _estimate_without(base, opening, decision, found, progress)
     passes = passes + best.passes
-    rival = None
-    if decision.rival is not None:
-        rival = found
-        if decision.rival.noise.excluded:
-            rival = _estimate_without(base, opening, decision.rival, found, progress)
-            passes = passes + rival.passes
     candidates = [weigh_evidence(base, replace(one, passes=Counter())) for one in (found, best)]
     passes = sum((one.passes for one in candidates), passes)
-    leading = candidates[-1]
-    for suspect in (_suspect_before, _suspect_segments):
-        suspected = list[Span]()
-        while True:
-            before, (suspected, spent) = suspected, suspect(base, leading, candidates)
-            passes, other = passes + Counter(filter=spent), None
-            if suspected and suspected != before:
-                with contextlib.suppress(*BREAKDOWN):  # from a filter that follows the wrong fixes
-                    other, more = _estimate_other(base, opening, found, leading, suspected, progress)
-                    passes = passes + more
-            if other is None:
-                break
-            other = weigh_evidence(base, replace(other, passes=Counter()))
-            passes = passes + other.passes
-            candidates.append(other)
-            if log_evidence(base, other) <= log_evidence(base, leading):
-                break
-            leading = other
-    return replace(max(candidates, key=lambda one: log_evidence(base, one)), passes=passes, rival=rival)
+    leading, suspected = candidates[-1], list[Span]()
+    while excluded := _list_spans(leading):
+        before, suspected = suspected, list_before(excluded, list_fix_times(base))
+        if not suspected or suspected == before:
+            break
+        other = None
+        with contextlib.suppress(*BREAKDOWN):  # from a filter that follows the wrong fixes
+            other, more = _estimate_other(base, opening, found, leading, suspected, progress)
+            passes = passes + more
+        if other is None:
+            break
+        other = weigh_evidence(base, replace(other, passes=Counter()))
+        passes = passes + other.passes
+        candidates.append(other)
+        if log_evidence(base, other) <= log_evidence(base, leading):
+            break
+        leading = other
+    return replace(max(candidates, key=lambda one: log_evidence(base, one)), passes=passes)
 
 
 def _estimate_other(
@@ -197,20 +186,6 @@ def _estimate_without(
     return readmit(base, estimate)
 
 
-def _suspect_before(base: Problem, leading: NoiseEstimate, _: list[NoiseEstimate]) -> tuple[list[Span], int]:
-    """Spans of fixes before those that an estimate leaves out."""
-    excluded = _list_spans(leading)
-    return (list_before(excluded, list_fix_times(base)) if excluded else []), 0
-
-
-def _suspect_segments(base: Problem, leading: NoiseEstimate, candidates: list[NoiseEstimate]) -> tuple[list[Span], int]:
-    """Wrong segments by an estimate's figures, of those between the ends of all spans that candidates leave out, unless
-    it leaves out the same; and filter passes."""
-    spans = sorted({span for one in candidates for span in _list_spans(one)})
-    segments, spent = find_segments(base, leading, spans)
-    return ([] if segments == _list_spans(leading) else segments), spent
-
-
 def _list_spans(found: NoiseEstimate | Decision) -> list[Span]:
     """Spans of fixes that are left out."""
     return join(span for kind in FIXES for span in found.noise.excluded.get(kind, ()))
@@ -228,14 +203,8 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     masking = begin_beside(partial(find_suspects, base, NoiseModel(medians), found))
     suspects = find_suspects(base, found.noise, found)
     first = explain(base, found, suspects)
-    segments, spent = find_segments(base, found, suspects)
-    passes = first.passes + Counter(filter=spent)
-    if segments:
-        other = explain(base, found, segments, least=first.log_evidence)
-        passes = passes + other.passes
-        first = replace(other, rival=first) if other.log_evidence > first.log_evidence else first
     masked = masking.get_result()
-    first = replace(first, passes=passes + Counter(filter=2))
+    first = replace(first, passes=first.passes + Counter(filter=2))
     return first if are_covered(masked, _list_spans(first)) else _unmask(base, found, first, masked)
 
 
@@ -250,8 +219,7 @@ def _unmask(
     masked : spans of fixes that are suspected besides those of the first.
     known : an estimate that uses these; it stands where it explains the rest better, too.
     """
-    best, estimate, spans, passes = first, found, masked, first.passes
-    rival, gain = first.rival or first, np.inf  # rival: by other spans than segments
+    best, estimate, spans, passes, gain = first, found, masked, first.passes, np.inf
     start = NoiseModel(found.noise.figures, found.noise.times, excluded=dict.fromkeys(FIXES, tuple(masked)))
     for _ in range(_REFINEMENTS):
         estimate = estimate_noise(base, None, start, estimate.get_linearisation(base))
@@ -276,18 +244,15 @@ def _unmask(
         for some in [*list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected), segments]:
             if not some:
                 continue
-            least = min(best.log_evidence, rival.log_evidence)
-            candidate = explain(base, add_outliers(estimate, errors, some), some, least=least)
+            candidate = explain(base, add_outliers(estimate, errors, some), some, least=best.log_evidence)
             candidate, passes = replace(candidate, estimate=estimate), passes + candidate.passes
             cut = cut_at_steps(some, candidate.noise, used, estimate)
             if cut != some:
                 among = list_explanations(candidate.noise)  # its pieces are wrong the same way, or not at all
-                finer = explain(base, add_outliers(estimate, errors, cut), cut, among, least)
+                finer = explain(base, add_outliers(estimate, errors, cut), cut, among, best.log_evidence)
                 finer, passes = replace(finer, estimate=estimate), passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
             most = max(most, candidate.log_evidence)
-            if some is not segments and candidate.log_evidence > rival.log_evidence:
-                rival = candidate
             if candidate.log_evidence > best.log_evidence:
                 best = candidate
         if sum_lengths(detected) > 2.0 * sum_lengths(masked):  # more fixes seem wrong outside the span than inside
@@ -304,7 +269,7 @@ def _unmask(
     if best.estimate is not None and not best.noise.excluded:  # the figures that go with these outliers
         free = estimate_noise(base, None, best.noise, best.estimate.get_linearisation(base))
         return Decision(free.noise, best.log_evidence, passes + free.passes, free)
-    return replace(best, passes=passes, rival=None if best is rival else rival)
+    return replace(best, passes=passes)
 
 
 def _weigh_beside(base: Problem, known: NoiseEstimate, spans: list[Span]) -> float:
@@ -334,17 +299,12 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     base : built with stated noise and the parts of its intervals' noise.
     found : with all intervals alike.
     """
-    best = _disturb_intervals(base, found)
-    if found.rival is not None:
-        other = _disturb_intervals(base, found.rival)
-        sure = log_evidence(base, best) > log_evidence(base, other) + best.gained_by_chance
-        best = replace(best if sure else other, passes=best.passes + other.passes - found.rival.passes, rival=None)
-    return choose_likeliest(base, best)
+    return choose_likeliest(base, _disturb_intervals(base, found))
 
 
 def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
-    """The same from one decision on what is wrong."""
-    found = weigh_evidence(base, replace(found, rival=None))
+    """The same before it is decided which part of a drive is right."""
+    found = weigh_evidence(base, found)
     start, near, passes = found.noise, found.get_linearisation(base), found.passes
     if not found.noise.excluded and not _may_be_disturbed(base, found):
         return found
