@@ -27,10 +27,11 @@ from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.motion import is_course_in_radians
 from graphnav.recording.draft.plain import Plain, add_words, read_plain
 from graphnav.recording.formats import columns as matching
+from graphnav.recording.formats.courses import blank_unknown
 from graphnav.recording.formats.folder import read_other_log
 from graphnav.recording.formats.places import check_angles, find_places
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.repair import blank_unknown, mask_new_fixes
+from graphnav.recording.formats.repair import mask_new_fixes
 from graphnav.recording.formats.schema import WHEELS
 from graphnav.recording.formats.stamps import find_repeated, find_repeats, spread_packets
 from graphnav.recording.formats.table import Table, read_column_names, read_first_rows, read_table

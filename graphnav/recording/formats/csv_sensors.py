@@ -12,6 +12,7 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Truth
 from graphnav.recording.formats import schema
+from graphnav.recording.formats.courses import blank_unknown, compute_horizontal_velocity
 from graphnav.recording.formats.increments import compute_periods, note_gaps
 from graphnav.recording.formats.places import convert_geodetic
 from graphnav.recording.formats.pulses import count_pulses
@@ -20,10 +21,8 @@ from graphnav.recording.formats.repair import (
     DEFAULT_SD_V,
     VAGUEST,
     VAGUEST_V,
-    blank_unknown,
     check_residuals,
     choose_sigmas,
-    compute_horizontal_velocity,
     parse_fix_types,
 )
 from graphnav.recording.formats.table import Table
