@@ -18,7 +18,6 @@ from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, LIKELY, Agreement, compare_with_fixes
 from graphnav.recording.draft.document import Document, format_vector
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.logs import Source
 from graphnav.recording.draft.raw import RawFound, find_raw, write_raw
 from graphnav.recording.draft.references import has_attitude, is_above_sea
 from graphnav.recording.draft.sources import (
@@ -27,6 +26,7 @@ from graphnav.recording.draft.sources import (
     guess_fix_speed_unit,
     read_fixes,
 )
+from graphnav.recording.draft.tables import Source
 from graphnav.recording.formats.schema import FORCE, RATE_UNITS, SPEED
 from graphnav.recording.formats.writer import quote
 

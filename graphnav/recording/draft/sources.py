@@ -15,10 +15,11 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import DAY, NEAR, UNIX, gps_to_utc
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.logs import CALLED, WANTED, NoSensorError, Source, has_gravity, read_log
+from graphnav.recording.draft.logs import CALLED, NoSensorError, has_gravity, read_log
 from graphnav.recording.draft.parts import join_parts
 from graphnav.recording.draft.raw import RawFiles, separate_raw, tell_kind
 from graphnav.recording.draft.references import separate_reference
+from graphnav.recording.draft.tables import WANTED, Source
 from graphnav.recording.formats import columns as matching
 from graphnav.recording.formats import list_formats
 from graphnav.recording.formats.schema import SPEED
