@@ -6,7 +6,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.recording.draft import guesses, motion
-from graphnav.recording.draft.readings import Readings
+from graphnav.recording.draft.log_columns import LogColumns
 from graphnav.recording.formats import columns as matching
 from graphnav.recording.formats.increments import compute_periods
 from graphnav.recording.formats.places import is_in_degrees_and_minutes, is_in_whole_degrees
@@ -17,7 +17,7 @@ _VELOCITIES, _OF_VELOCITIES = ("ve", "vn", "vu", "vd"), ("sd_ve", "sd_vn", "sd_v
 _WHOLE_UNITS = {"mm/s": 1e-3, "cm/s": 1e-2, "m/s": 1.0}  # of velocities in whole numbers: u-blox, MAVLink, rounded
 
 
-def convert_small_units(of: Readings) -> None:
+def convert_small_units(of: LogColumns) -> None:
     """Columns whose names state mm, cm, or these per second, made m and m/s, which are the units of a recording."""
     stated = {ours: matching.NAMED_UNITS.get(of.units.get(ours, ""), ("", ""))[1] for ours in of.values}
     small = {ours: unit for ours, unit in stated.items() if unit in _SMALL_UNITS}
@@ -30,7 +30,7 @@ def convert_small_units(of: Readings) -> None:
     of.say(f"{', '.join(pairs)}, made m or m/s")
 
 
-def divide_increments(of: Readings, second: float) -> None:
+def divide_increments(of: LogColumns, second: float) -> None:
     """Increments of angle and velocity, known by their names, divided by their sample period; `second` is t's unit."""
     some = [ours for ours in ("gx", "gy", "gz", "ax", "ay", "az") if matching.is_increment(of.names.get(ours, ""))]
     if not some:
@@ -44,7 +44,7 @@ def divide_increments(of: Readings, second: float) -> None:
     of.say(words)
 
 
-def convert_variances(of: Readings) -> None:
+def convert_variances(of: LogColumns) -> None:
     """Sigmas of variances, which are what columns of a covariance hold."""
     squared = [ours for ours in _SIGMAS if "cov" in of.names.get(ours, "").lower()]
     if not squared:
@@ -55,7 +55,7 @@ def convert_variances(of: Readings) -> None:
     of.say(words)
 
 
-def convert_whole_degrees(of: Readings) -> bool:
+def convert_whole_degrees(of: LogColumns) -> bool:
     """Places in whole numbers of 1e-7 deg, as u-blox and MAVLink have them, in deg, heights and accuracies in m.
 
     Both write accuracies in mm (h_acc, v_acc); MAVLink's eph and epv, and whole numbers of speed and course, are in
@@ -84,7 +84,7 @@ def convert_whole_degrees(of: Readings) -> bool:
     return True
 
 
-def convert_minutes(of: Readings) -> None:
+def convert_minutes(of: LogColumns) -> None:
     """Places as receivers' sentences have them, degrees and minutes together, in deg.
 
     They are no degrees, as latitudes are beyond 90.
@@ -99,7 +99,7 @@ def convert_minutes(of: Readings) -> None:
     of.say(words)
 
 
-def convert_whole_velocities(of: Readings, second: float) -> None:
+def convert_whole_velocities(of: LogColumns, second: float) -> None:
     """Velocities beside places in whole numbers, where they are whole too: mm/s or cm/s, as the places move, made m/s.
 
     They are left alone where the places do not tell; `second` is t's unit.

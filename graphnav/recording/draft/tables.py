@@ -24,9 +24,9 @@ from graphnav.recording.draft.conversion import (
     divide_increments,
 )
 from graphnav.recording.draft.guesses import Guess
+from graphnav.recording.draft.log_columns import LogColumns
 from graphnav.recording.draft.motion import is_course_in_radians
 from graphnav.recording.draft.plain import Plain
-from graphnav.recording.draft.readings import Readings
 from graphnav.recording.formats import columns as matching
 from graphnav.recording.formats.courses import blank_unknown
 from graphnav.recording.formats.places import check_angles, find_places
@@ -168,7 +168,7 @@ def read_sensor(
     return Source(path, found, of.values, t_unit=unit, week=week, plain=of.plain)
 
 
-def _read_columns(path: Path, columns: matching.FileColumns, role: str, plain: Plain | None) -> Readings:
+def _read_columns(path: Path, columns: matching.FileColumns, role: str, plain: Plain | None) -> LogColumns:
     """What a sensor can have of a table's columns, as they are in the file."""
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in WANTED[role]}
     if role in ("imu", *PLACED) and "week" in columns.names:
@@ -186,10 +186,10 @@ def _read_columns(path: Path, columns: matching.FileColumns, role: str, plain: P
             raise RecordingError(
                 f"{table.describe_place(bad[0], ours)}: the value is infinite; leave it blank", key="table.not_finite"
             )
-    return Readings(table, dict(names), columns.units, plain)
+    return LogColumns(table, dict(names), columns.units, plain)
 
 
-def _blank_unknown(of: Readings, whole: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _blank_unknown(of: LogColumns, whole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Blank what a phone does not know; which of the `whole` rows (N,) have a known position.
 
     Raises
@@ -208,7 +208,7 @@ def _blank_unknown(of: Readings, whole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return whole
 
 
-def _mask_places(of: Readings, whole: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _mask_places(of: LogColumns, whole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which of the `whole` rows (N,) are on the Earth."""
     lat, lon = of.values["lat"], of.values["lon"]
     placed = whole.copy()
@@ -217,7 +217,7 @@ def _mask_places(of: Readings, whole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return placed
 
 
-def _convert_clock(of: Readings) -> None:
+def _convert_clock(of: LogColumns) -> None:
     """Times of day in digits, and days of a spreadsheet, in s."""
     t, name = of.values["t"], of.names["t"]
     if (seconds := read_clock_seconds(t)) is not None:
@@ -229,7 +229,7 @@ def _convert_clock(of: Readings) -> None:
         of.plain = Plain({}, words)
 
 
-def _sort_by_time(of: Readings, second: float, inertial: bool) -> None:
+def _sort_by_time(of: LogColumns, second: float, inertial: bool) -> None:
     """Rows in order on a clock that goes on, those of an IMU's packets at the times of their own."""
     if (later := find_restarts(of.values["t"], second)) is not None:
         of.change("t", of.values["t"] + later)
@@ -238,7 +238,7 @@ def _sort_by_time(of: Readings, second: float, inertial: bool) -> None:
         of.change("t", spread[0] / second)
 
 
-def _drop_repeated(of: Readings) -> NDArray[np.bool_]:
+def _drop_repeated(of: LogColumns) -> NDArray[np.bool_]:
     """Keep one row of each time; which rows (N,) were left out."""
     where, t = f"{of.table.path}, column '{of.names['t']}'", of.values["t"]
     repeated = find_repeated(where, t)
@@ -250,7 +250,7 @@ def _drop_repeated(of: Readings) -> NDArray[np.bool_]:
     return repeated
 
 
-def _convert_fixes(of: Readings, second: float, counted: bool) -> None:
+def _convert_fixes(of: LogColumns, second: float, counted: bool) -> None:
     """One row of each fix, courses in deg, and velocities in m/s if places are `counted` in whole numbers."""
     of.take(mask_new_fixes(of.values))
     values = of.values
@@ -261,7 +261,7 @@ def _convert_fixes(of: Readings, second: float, counted: bool) -> None:
         convert_whole_velocities(of, second)
 
 
-def _refuse_pauses(of: Readings) -> None:
+def _refuse_pauses(of: LogColumns) -> None:
     t = of.values["t"]
     step = np.diff(t)
     if step.sum() > _PAUSES * len(step) * np.median(step):
@@ -273,14 +273,14 @@ def _refuse_pauses(of: Readings) -> None:
         )
 
 
-def _average_wheels(of: Readings) -> None:
+def _average_wheels(of: LogColumns) -> None:
     """The speed, the mean of the rear wheels, else of those there are."""
     rear = [w for w in WHEELS[2:] if w in of.values] or [w for w in WHEELS if w in of.values]
     of.change("speed", np.mean([of.values[w] for w in rear], axis=0))
     of.units = {**of.units, "speed": of.units.get(rear[0], "")}
 
 
-def _find_week(of: Readings, weeks: Array, unit: Guess) -> tuple[int | None, Guess]:
+def _find_week(of: LogColumns, weeks: Array, unit: Guess) -> tuple[int | None, Guess]:
     """The GPS week of the first row, 0 where stamps count from the GPS epoch, and the unit of these."""
     if len(weeks) and weeks[0] > 0 and np.isfinite(weeks[0]):
         return int(weeks[0]), unit

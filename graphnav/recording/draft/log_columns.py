@@ -10,7 +10,7 @@ from graphnav.recording.formats.table import Selection, Table
 
 
 @dataclass(eq=False)
-class Readings:
+class LogColumns:
     """What each step of a conversion changes."""
 
     table: Table  # the columns by our names
