@@ -26,7 +26,7 @@ def convert_small_units(of: LogColumns) -> None:
     pairs = dict.fromkeys(f"'{of.names[ours]}' in {unit}" for ours, unit in small.items())
     for ours, unit in small.items():
         of.convert(ours, of.values[ours] * _SMALL_UNITS[unit])
-    of.units = {ours: unit for ours, unit in of.units.items() if ours not in small}
+    of.forget_units(small)
     of.say(f"{', '.join(pairs)}, made m or m/s")
 
 
@@ -80,6 +80,7 @@ def convert_whole_degrees(of: LogColumns) -> bool:
         words += f", {', '.join(dict.fromkeys(repr(of.names[ours]) for ours in lengths))} in mm, made m"
     for ours in ("lat", "lon", *lengths):
         of.convert(ours, of.values[ours] * (1e-3 if ours in lengths else 1e-7))
+    of.forget_units(lengths)
     of.say(words)
     return True
 
@@ -123,6 +124,7 @@ def convert_whole_velocities(of: LogColumns, second: float) -> None:
     of.drop(*(ours for ours in sigmas if ours not in there))
     for ours in there:
         of.convert(ours, values[ours] * _WHOLE_UNITS[str(found.value)])
+    of.forget_units(there)
     of.say(f"{words} in {found.value}, as {found.why}, made m/s")
 
 

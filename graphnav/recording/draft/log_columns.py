@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from graphnav.core.rotation import Array
@@ -35,6 +36,10 @@ class LogColumns:
         """Set a column (N,) that is no longer as it is in the file."""
         self.change(name, values)
         self.names[name] = name
+
+    def forget_units(self, names: Collection[str]) -> None:
+        """Columns that are no longer in the units that the file's names state."""
+        self.units = {ours: unit for ours, unit in self.units.items() if ours not in names}
 
     def drop(self, *names: str) -> None:
         """Leave out columns."""

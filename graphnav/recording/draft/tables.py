@@ -26,7 +26,7 @@ from graphnav.recording.draft.conversion import (
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.log_columns import LogColumns
 from graphnav.recording.draft.motion import is_course_in_radians
-from graphnav.recording.draft.plain import Plain
+from graphnav.recording.draft.plain import Plain, add_words
 from graphnav.recording.formats import columns as matching
 from graphnav.recording.formats.courses import blank_unknown
 from graphnav.recording.formats.places import check_angles, find_places
@@ -221,12 +221,12 @@ def _convert_clock(of: LogColumns) -> None:
     """Times of day in digits, and days of a spreadsheet, in s."""
     t, name = of.values["t"], of.names["t"]
     if (seconds := read_clock_seconds(t)) is not None:
-        of.change("t", seconds)
-        of.plain = Plain({}, f"times of day of '{name}', hhmmss, as s since midnight", daily=name)
+        words = f"times of day of '{name}', hhmmss, as s since midnight"
+        of.plain = replace(add_words(of.plain, words), daily=name)
     elif (seconds := read_serial_days(t)) is not None:
+        of.say(f"days of '{name}', as a spreadsheet counts them, as Unix time in s; CHECK: taken as UTC")
+    if seconds is not None:
         of.change("t", seconds)
-        words = f"days of '{name}', as a spreadsheet counts them, as Unix time in s; CHECK: taken as UTC"
-        of.plain = Plain({}, words)
 
 
 def _sort_by_time(of: LogColumns, second: float, inertial: bool) -> None:
