@@ -38,13 +38,13 @@ from graphnav.recording.formats.table import Table, read_table
 from graphnav.sensors.tables import ANGLE, TIME_UNITS
 
 _PLACE = ["t", "lat", "lon", "h"]
-_VELOCITY = ["ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course"]
+VELOCITIES = ("ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course")
 WANTED = {
     "imu": ("t", "gx", "gy", "gz", "ax", "ay", "az"),
     "gyro": ("t", "gx", "gy", "gz"),
     "accel": ("t", "ax", "ay", "az"),
-    "gnss": (*_PLACE, "sd_e", "sd_n", "sd_u", *_VELOCITY, "type", "satellites", "resid_rms_m", "geoid"),
-    "truth": (*_PLACE, *_VELOCITY[:4], *matching.ATTITUDE),
+    "gnss": (*_PLACE, "sd_e", "sd_n", "sd_u", *VELOCITIES, "type", "satellites", "resid_rms_m", "geoid"),
+    "truth": (*_PLACE, *VELOCITIES[:4], *matching.ATTITUDE),
     "odometer": ("t", "speed", *WHEELS),
     "barometer": ("t", "pressure"),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
