@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -26,6 +28,11 @@ from graphnav.app.cli_options import (
 from graphnav.app.talk import NOT_MET, Interrupted, print_out, say, warn
 from graphnav.core.errors import ConfigError
 from graphnav.core.notes import format_count
+
+if TYPE_CHECKING:
+    from graphnav.app.fleet.drive import FleetRow
+    from graphnav.app.fleet.manifest import Task
+    from graphnav.app.fleet.workers import Limits
 
 commands = typer.Typer()
 
@@ -80,9 +87,7 @@ def fleet(
     result, with 2 if none has.
     """
     from graphnav.app import convert, outputs
-    from graphnav.app.fleet import manifest, page, tables, workers
-    from graphnav.app.fleet.drive import DONE, FleetRow
-    from graphnav.core.staging import resolve_final_path, stage_results
+    from graphnav.app.fleet import manifest, tables, workers
 
     convert.check_rate(rate)
     if withhold is not None and not withhold > 0.0:
@@ -108,28 +113,9 @@ def fleet(
         )
         for drive in drives
     ]
-    if scheduler is not None:
-        found = workers.solve_on_cluster(tasks, scheduler, workers.Limits(limit, memory))
-    else:
-        count = processes or _count_processors()
-        found = workers.solve_here(tasks, count, workers.Limits(limit, memory or workers.share_of_memory(count)))
-    done: dict[str, FleetRow] = {}
-    try:
-        for row in found:
-            done[row["drive"]] = row if len(done) < page.DRAWN else {**row, "track": None}
-            if not (quiet or json):
-                say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_format_drive(row)}")
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted after {len(done)} of {len(tasks)} drives; the same command continues") from None
-    rows = [done[task.name] for task in tasks]
-    with stage_results(folder) as part:
-        tables.write_fleet_csv(rows, part / "fleet.csv")
-        files = [part / "fleet.csv"]
-        if tables.write_parquet(rows, part / "fleet.parquet"):
-            files.append(part / "fleet.parquet")
-        page.write_page(rows, part / "fleet.html", f"{source.name}: {format_count(len(rows), 'drive')}")
-        files.insert(0, part / "fleet.html")
-    files = resolve_final_path(files, part, folder)
+    limits = workers.Limits(limit, memory)
+    rows = _solve_all(tasks, processes, limits, scheduler, say_each=not (quiet or json))
+    files = _write_results(rows, folder, source.name)
     lacking = "" if withhold is None else tables.describe_unscored(rows, withhold)
     lacking += "" if len(files) > 2 else "\nno fleet.parquet: pyarrow is not installed"
     print_out(
@@ -143,6 +129,57 @@ def fleet(
         json,
         lambda: [f"{row['drive']}: {row.get('doubts') or _format_drive(row)}" for row in _select_wrong(rows)],
     )
+    _insist_on_results(rows, source, folder)
+
+
+def _solve_all(
+    tasks: Sequence[Task], processes: int | None, limits: Limits, scheduler: str | None, say_each: bool
+) -> list[FleetRow]:
+    """A row for each drive, solved here or on a cluster; without its track beyond what the page draws.
+
+    Raises
+    ------
+    Interrupted
+        On Ctrl-C.
+    """
+    from graphnav.app.fleet import page, workers
+
+    if scheduler is not None:
+        found = workers.solve_on_cluster(tasks, scheduler, limits)
+    else:
+        count = processes or _count_processors()
+        memory = limits.memory_mb or workers.share_of_memory(count)
+        found = workers.solve_here(tasks, count, replace(limits, memory_mb=memory))
+    done: dict[str, FleetRow] = {}
+    try:
+        for row in found:
+            done[row["drive"]] = row if len(done) < page.DRAWN else {**row, "track": None}
+            if say_each:
+                say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_format_drive(row)}")
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted after {len(done)} of {len(tasks)} drives; the same command continues") from None
+    return [done[task.name] for task in tasks]
+
+
+def _write_results(rows: list[FleetRow], folder: Path, name: str) -> list[Path]:
+    """The page and the tables of a fleet, and where they are; no Parquet without pyarrow."""
+    from graphnav.app.fleet import page, tables
+    from graphnav.core.staging import resolve_final_path, stage_results
+
+    with stage_results(folder) as part:
+        tables.write_fleet_csv(rows, part / "fleet.csv")
+        files = [part / "fleet.csv"]
+        if tables.write_parquet(rows, part / "fleet.parquet"):
+            files.append(part / "fleet.parquet")
+        page.write_page(rows, part / "fleet.html", f"{name}: {format_count(len(rows), 'drive')}")
+        files.insert(0, part / "fleet.html")
+    return resolve_final_path(files, part, folder)
+
+
+def _insist_on_results(rows: list[FleetRow], source: Path, folder: Path) -> None:
+    """Say how many drives have no result, and leave so."""
+    from graphnav.app.fleet.drive import DONE
+
     lost = sum(row["status"] != DONE for row in rows)
     if lost == len(rows):
         raise ConfigError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +12,7 @@ from graphnav.core.errors import ConfigError
 from graphnav.core.memory import pause_collector
 
 if TYPE_CHECKING:
+    from graphnav.app.reading import AskedPart
     from graphnav.config import Settings
 
 SourceArgument = Annotated[
@@ -104,6 +106,51 @@ Require = Annotated[
 AllowOutside = Annotated[
     bool, typer.Option("--allow-outside", help="Also read files outside its own folder that RECORDING names.")
 ]
+
+
+@dataclass(frozen=True)
+class OtherTrajectories:
+    """Other programs' trajectories to compare with: files, their point on the body, and s to add to their stamps."""
+
+    files: list[Path]
+    points: list[str]
+    shifts: list[float]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The options of smooth and compare, as they were typed."""
+
+    recording: str
+    out: Path
+    profile: str | None
+    config: Path | None
+    noise: str | None
+    detectors: str | None
+    without: list[str] | None
+    rate: float | None
+    start: float | None
+    end: float | None
+    require: list[str] | None
+    format: str | None
+    topic: list[str] | None
+    allow_outside: bool
+    quiet: bool
+    json: bool
+    pages: bool
+    export: str | None
+    point: str | None
+    solvers: tuple[str, ...]
+    alone: bool  # whether the files are written straight into the folder, as for a single solver
+    others: OtherTrajectories | None = None
+    loose: bool = False
+
+    @property
+    def part(self) -> AskedPart:
+        """What is to be read."""
+        from graphnav.app.reading import AskedPart
+
+        return AskedPart(self.recording, self.start, self.end, tuple(self.topic or ()), self.format, self.allow_outside)
 
 
 def pick_one(context: typer.Context, recording: str) -> str:

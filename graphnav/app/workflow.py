@@ -175,66 +175,35 @@ def _solve_request(
     reading = reading or begin_reading(request.part)
     load_solvers(request.solvers)  # which takes as long
     found = reading.get_result()
-    recording, zero, timings = found.recording, found.zero, found.timings
-    if request.folder is not None:
-        targets = (request.folder / name for name in request.results)
-        keep_inputs(request.folder, targets, (*recording.files, *(one.path for one in request.against)))
-    check_names(request.exported, recording.gps_zero)
-    if request.point == "antenna" and recording.gnss is None:
-        raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
-    checks = Checks(recording, found.rows)
+    zero, timings = found.zero, found.timings
+    _check_results(request, found.recording)
+    checks = Checks(found.recording, found.rows)
     recording, moved = found.rows[0], shift_spans(request.withheld, zero)
     used, notes = withhold(recording, moved, zero)
     if is_truth_apart(recording):
         recording = replace(recording, truth=None)
 
-    from graphnav.estimation.pipeline import run
     from graphnav.report.doubts import list_doubts
 
-    given = request.noise
-    model = None if given is None else given.model
-    if request.loose and not used.is_tight(request.settings.raw_gnss.coupling):
-        raise ConfigError(
-            f"--loose: '{used.name}' has no raw observations that are used in place of fixes", key="option.not_here"
-        )
-    try:
-        solutions = run(used, request.settings, request.solvers, checks.await_before(_SOLVING, progress), model)
-    except Exception as error:  # where the recording cannot be solved, that comes first
-        known = checks.get_findings()
-        if isinstance(error, EstimationError):
-            raise _name_cause(error, known) from None
-        raise
+    solutions = _run_solvers(request, used, checks, progress)
     known = checks.get_findings()
     timings["checks"] += checks.seconds
-    findings = [f.sentence for f in known]
-    if request.loose:
-        others = run(used, couple_loosely(request.settings), request.solvers, progress, model)
-        solutions |= {name + LOOSE: replace(one, solver=name + LOOSE) for name, one in others.items()}
-        solutions = {name: solutions[name] for name in name_runs(request.solvers, True)}
-    if given is not None:
-        notes += list_unused_noise(given.model, next(iter(solutions.values())))
+    if request.noise is not None:
+        notes += list_unused_noise(request.noise.model, next(iter(solutions.values())))
     solutions = {
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
+    findings = [f.sentence for f in known]
     known = _mitigate(known, solutions)
     look = partial(_find_wrong_arms, used, known, dict(solutions))
     looking = begin_beside(look) if request.judge_arms else Later(look)  # which takes a second
     solutions |= _read_others(request, recording, solutions)
     with measure_time(timings, "evaluation"):
-        try:
-            metrics, against, names = score(recording, used, solutions, moved)
-        except RecordingError as error:
-            if error.key != "truth.too_little":
-                raise
-            metrics, against, names = {}, None, ()
-            findings.append(Note(error.key, f"not compared with the truth: {error}"))
+        metrics, against, names, remarks = _compare(recording, used, solutions, moved)
     in_parts = any(len(one.between) > 1 for one in select_own(solutions).values())
     if in_parts:
         return_memory()
-    for name, compared in metrics.items():
-        for note in compared.notes:
-            shared = all(note in other.notes for other in metrics.values())
-            findings.append(note if shared else Note(get_key(note), f"{name}: {note}"))
+    findings += remarks
     errors = {name: one.errors for name, one in metrics.items() if one.errors is not None}
     if request.judge_arms or list_doubts(solutions, errors):
         known = (*looking.get_result(), *known)
@@ -246,6 +215,64 @@ def _solve_request(
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
         tuple(f.sentence for f in known if f.severity != "note"), timings, known, densities,
     )  # fmt: skip
+
+
+def _check_results(request: Request, recording: Recording) -> None:
+    """Refuse results that would replace what is read, and those that the recording does not have."""
+    if request.folder is not None:
+        targets = (request.folder / name for name in request.results)
+        keep_inputs(request.folder, targets, (*recording.files, *(one.path for one in request.against)))
+    check_names(request.exported, recording.gps_zero)
+    if request.point == "antenna" and recording.gnss is None:
+        raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
+
+
+def _run_solvers(request: Request, used: Recording, checks: Checks, progress: Progress | None) -> dict[str, Solution]:
+    """The solutions by name, once more from fixes if asked for.
+
+    Raises
+    ------
+    RecordingError
+        If the checks find that the recording cannot be solved, which comes before what goes wrong because of it.
+    """
+    from graphnav.estimation.pipeline import run
+
+    model = None if request.noise is None else request.noise.model
+    if request.loose and not used.is_tight(request.settings.raw_gnss.coupling):
+        raise ConfigError(
+            f"--loose: '{used.name}' has no raw observations that are used in place of fixes", key="option.not_here"
+        )
+    try:
+        solutions = run(used, request.settings, request.solvers, checks.await_before(_SOLVING, progress), model)
+    except Exception as error:
+        known = checks.get_findings()
+        if isinstance(error, EstimationError):
+            raise _name_cause(error, known) from None
+        raise
+    checks.get_findings()
+    if not request.loose:
+        return solutions
+    others = run(used, couple_loosely(request.settings), request.solvers, progress, model)
+    solutions |= {name + LOOSE: replace(one, solver=name + LOOSE) for name, one in others.items()}
+    return {name: solutions[name] for name in name_runs(request.solvers, True)}
+
+
+def _compare(
+    recording: Recording, used: Recording, solutions: Mapping[str, Solution], moved: tuple[Withheld, ...]
+) -> tuple[dict[str, Metrics], str | None, tuple[str, ...], list[str]]:
+    """The metrics of solutions, what they are against, what is missing in each of their spans, and remarks on them."""
+    try:
+        metrics, against, names = score(recording, used, solutions, moved)
+    except RecordingError as error:
+        if error.key != "truth.too_little":
+            raise
+        return {}, None, (), [Note(error.key, f"not compared with the truth: {error}")]
+    remarks: list[str] = []
+    for name, compared in metrics.items():
+        for note in compared.notes:
+            shared = all(note in other.notes for other in metrics.values())
+            remarks.append(note if shared else Note(get_key(note), f"{name}: {note}"))
+    return metrics, against, names, remarks
 
 
 def _find_wrong_arms(

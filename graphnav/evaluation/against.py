@@ -108,33 +108,12 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     """
     track = read_trajectory(asked.path)
     notes = Notes(track.notes)
-    if asked.shift is not None:
-        track = replace(track, t=track.t + asked.shift)
-        notes.add("against.shift", f"{asked.path.name}: stamps shifted by {asked.shift:+g} s, as asked")
-    else:
-        shift, words = _shift(asked.path, track, recording, reference)
-        track = replace(track, t=track.t + shift)
-        notes += words
-    inside = (track.t >= reference.t[0]) & (track.t <= reference.t[-1])
-    if inside.sum() < _FEWEST_COMMON:
-        raise RecordingError(
-            f"{asked.path}: {format_count(int(inside.sum()), 'row')} in common with "
-            f"'{recording.name}': its time runs from {track.t[0]:.3f} to {track.t[-1]:.3f} s, the "
-            f"recording's from {reference.t[0]:.3f} to {reference.t[-1]:.3f} s; --against-shift says what to add",
-            key="against.no_overlap",
-        )
+    track = _put_on_clock(asked, track, recording, reference, notes)
     if track.frame == "local":
-        at = track.t[inside]
-        p = reference.at(at)[1].p
-        require_right_handed(str(asked.path), track.llh[inside], p)
-        yaw, offset = fit_yaw(track.llh[inside], p)
-        track = place_on_earth(track, reference.frame, yaw, offset)
-        notes.add(
-            "against.frame",
-            f"{asked.path.name}: metres in a local frame, rotated by {np.degrees(yaw):.1f} deg onto ours",
-        )
-    arm, ours = asked.point, find_antenna_lever_arm(recording, reference)
+        track = _place_on_ours(asked.path, track, reference, notes)
+    ours = find_antenna_lever_arm(recording, reference)
     lever_arm = None if recording.gnss is None else recording.gnss.lever_arm
+    arm = asked.point
     if isinstance(arm, str) and arm == "antenna":
         if ours is None:
             raise RecordingError(
@@ -152,12 +131,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
             f"{asked.path.name}: has no attitude; that of {reference.solver} places its lever arm",
         )
     elif recording.truth is None or recording.truth.rph is None:  # else it is compared with that
-        inside = (track.t >= reference.t[0]) & (track.t <= reference.t[-1])
-        states = reference.at(track.t[inside])[1]
-        R_lb = track.take(inside).R_lb
-        assert R_lb is not None
-        other = find_other_axes(R_lb, reference.frame.R_ln(states.p) @ states.R_nb)
-        notes.extend(Note(get_key(one), f"{asked.path.name}: {one}") for one in other)
+        notes += _compare_axes(asked.path, track, reference)
     if np.any(arm):
         track = interpolate(track, track.t, max_gap=_MAX_GAP, lever_arm=-arm)[0]
         notes.add(
@@ -173,6 +147,58 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         name, reference.frame, t, states, unknown,
         notes=tuple(notes), track=track, borrowed=borrowed, lever_arm=lever_arm,
     )  # fmt: skip
+
+
+def _take_inside(track: Trajectory, reference: Solution) -> Trajectory:
+    """The rows of a trajectory between the first and the last of a solution."""
+    return track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
+
+
+def _put_on_clock(
+    asked: Against, track: Trajectory, recording: Recording, reference: Solution, notes: Notes
+) -> Trajectory:
+    """The trajectory on the recording's clock, as asked or as its stamps and speeds show.
+
+    Raises
+    ------
+    RecordingError
+        If it shares no time with the recording.
+    """
+    if asked.shift is not None:
+        track = replace(track, t=track.t + asked.shift)
+        notes.add("against.shift", f"{asked.path.name}: stamps shifted by {asked.shift:+g} s, as asked")
+    else:
+        shift, words = _shift(asked.path, track, recording, reference)
+        track = replace(track, t=track.t + shift)
+        notes += words
+    common = len(_take_inside(track, reference))
+    if common < _FEWEST_COMMON:
+        raise RecordingError(
+            f"{asked.path}: {format_count(common, 'row')} in common with "
+            f"'{recording.name}': its time runs from {track.t[0]:.3f} to {track.t[-1]:.3f} s, the "
+            f"recording's from {reference.t[0]:.3f} to {reference.t[-1]:.3f} s; --against-shift says what to add",
+            key="against.no_overlap",
+        )
+    return track
+
+
+def _place_on_ours(path: Path, track: Trajectory, reference: Solution, notes: Notes) -> Trajectory:
+    """A trajectory in metres of a frame of its own, turned and moved onto ours."""
+    inside = _take_inside(track, reference)
+    p = reference.at(inside.t)[1].p
+    require_right_handed(str(path), inside.llh, p)
+    yaw, offset = fit_yaw(inside.llh, p)
+    notes.add("against.frame", f"{path.name}: metres in a local frame, rotated by {np.degrees(yaw):.1f} deg onto ours")
+    return place_on_earth(track, reference.frame, yaw, offset)
+
+
+def _compare_axes(path: Path, track: Trajectory, reference: Solution) -> list[Note]:
+    """That the axes of a trajectory's attitude are other than ours, if they are."""
+    inside = _take_inside(track, reference)
+    states, R_lb = reference.at(inside.t)[1], inside.R_lb
+    assert R_lb is not None
+    other = find_other_axes(R_lb, reference.frame.R_ln(states.p) @ states.R_nb)
+    return [Note(get_key(one), f"{path.name}: {one}") for one in other]
 
 
 def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solution) -> tuple[float, Notes]:
@@ -213,7 +239,7 @@ def _require_same_drive(asked: Against, track: Trajectory, recording: Recording,
     RecordingError
         If it is of another drive, or on another clock.
     """
-    inside = track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
+    inside = _take_inside(track, reference)
     if track.frame == "geodetic":
         apart = np.linalg.norm(reference.frame.from_llh(inside.llh) - reference.at(inside.t)[1].p, axis=1)
         if np.nanmin(apart) > _FARTHEST:
@@ -264,7 +290,7 @@ def _find_other_point(
 
     A discrepancy that turns with the body is a lever arm; one that does not is due to another datum, and is ignored.
     """
-    inside = track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
+    inside = _take_inside(track, reference)
     states = reference.at(inside.t)[1]
     off = reference.frame.from_llh(inside.llh) - states.p
 
@@ -310,7 +336,7 @@ def _measure_delay(track: Trajectory, reference: Solution) -> float | None:
 
 def _borrow_attitude(track: Trajectory, reference: Solution) -> Trajectory:
     """The part of a trajectory that a solution covers, with the attitude of that solution."""
-    inside = track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
+    inside = _take_inside(track, reference)
     states = reference.at(inside.t)[1]
     return replace(inside, rph=rotation.to_rph(reference.frame.R_ln(states.p) @ states.R_nb))
 

@@ -63,9 +63,56 @@ def compute_errors(
     RecordingError
         If no epoch is shared, or a local frame cannot be fitted because nothing moves.
     """
-    notes = Notes([*trajectory.notes, *truth.notes])
-    if lever_arm is not None and not np.any(lever_arm):
-        lever_arm = None
+    lever_arm = lever_arm if lever_arm is not None and np.any(lever_arm) else None
+    notes = Notes([*trajectory.notes, *truth.notes, *_list_shortcomings(trajectory, lever_arm)])
+    flat = truth.frame == "local" and bool(np.isnan(truth.llh[:, 2]).all())
+    if "local" not in (trajectory.frame, truth.frame):
+        from_start = False
+    else:
+        from_start = trajectory.frame == "local" if from_start is None else from_start
+        trajectory, truth = _fit_frames(trajectory, truth, lever_arm, max_gap, at, notes)
+    estimate, seen, travel, epochs = _pair_epochs(trajectory, truth, lever_arm, max_gap, at)
+    if measure_spacing(truth.t) < measure_spacing(trajectory.t) if at is None else _are_between(seen.t, truth.t):
+        notes.add(
+            "truth.interpolated", "compared at the estimate's own epochs, to which the denser truth is interpolated"
+        )
+    p = np.einsum("kij,kj->ki", enu_axes(seen.llh), llh_to_ecef(estimate.llh) - llh_to_ecef(seen.llh))
+    if flat:
+        p[:, 2] = np.nan
+    missing = np.full((len(seen), 3), np.nan)
+    v = missing if estimate.v is None or seen.v is None else estimate.v - seen.v
+    rph, theta = _subtract_attitudes(estimate, seen, notes)
+    notes += find_other_heights(p[:, 2])
+    cov = _find_covariance(estimate, seen, from_start, notes)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        per_axis = p**2 / np.diagonal(cov, axis1=-2, axis2=-1)[:, :3]
+    if truth.v is None:
+        notes.add("truth.no_velocity", "the truth has no velocity: its direction of travel is taken from its positions")
+    dof = 2 if flat else 3
+    return Errors(
+        t=seen.t,
+        p=p,
+        track=_turn_along_track(p, travel),
+        v=v,
+        rph=rph,
+        sd_p=missing if estimate.sd_p is None else estimate.sd_p,
+        sd_v=missing if estimate.sd_v is None else estimate.sd_v,
+        sd_rph=missing if estimate.sd_rph is None else estimate.sd_rph,
+        nees_p=_compute_nees(p[:, :dof], cov[:, :dof, :dof]),
+        nees_axis=np.where(np.isfinite(per_axis), per_axis, np.nan),
+        nees_v=_compute_nees(v, cov[:, 3:6, 3:6]),
+        nees_rph=_compute_attitude_nees(theta, estimate, cov),
+        distance=measure_distance(seen.t, seen.llh),
+        dof_p=dof,
+        epochs=epochs,
+        notes=tuple(dict.fromkeys(notes)),
+        nees_heading=_compute_nees(rph[:, 2:], cov[:, 8:, 8:]),
+    )
+
+
+def _list_shortcomings(trajectory: Trajectory, lever_arm: Array | None) -> Notes:
+    """What an estimate lacks for its lever arm to the truth's point, and for its NEES."""
+    notes = Notes()
     if lever_arm is not None and trajectory.rph is None:
         arm = float(np.max(np.linalg.norm(lever_arm, axis=-1)))
         notes.add(
@@ -81,71 +128,39 @@ def compute_errors(
         notes.add(
             "nees.no_correlations", "NEES from the sigmas alone: the estimate comes without correlations between axes"
         )
-    flat = truth.frame == "local" and bool(np.isnan(truth.llh[:, 2]).all())
-    fitted = "local" in (trajectory.frame, truth.frame)
-    from_start = fitted and (trajectory.frame == "local" if from_start is None else from_start)
-    if trajectory.frame == "local" or truth.frame == "local":
-        trajectory, truth = _fit_frames(trajectory, truth, lever_arm, max_gap, at, notes)
-    estimate, seen, travel, epochs = _pair_epochs(trajectory, truth, lever_arm, max_gap, at)
-    if measure_spacing(truth.t) < measure_spacing(trajectory.t) if at is None else _are_between(seen.t, truth.t):
-        notes.add(
-            "truth.interpolated", "compared at the estimate's own epochs, to which the denser truth is interpolated"
-        )
+    return notes
 
-    R_le = enu_axes(seen.llh)
-    p = np.einsum("kij,kj->ki", R_le, llh_to_ecef(estimate.llh) - llh_to_ecef(seen.llh))
-    if flat:
-        p[:, 2] = np.nan
-    missing = np.full((len(seen), 3), np.nan)
-    v = missing if estimate.v is None or seen.v is None else estimate.v - seen.v
-    rph, theta = missing, missing
-    if estimate.rph is not None and seen.rph is not None:
-        rph = rotation.wrap(estimate.rph - seen.rph)
-        # by the rotation, not the angles: these are strongly nonlinear where a foot points down
-        mine, theirs = rotation.from_rph(estimate.rph), rotation.from_rph(seen.rph)
-        theta = rotation.log(np.swapaxes(mine, -1, -2) @ theirs)
-        notes += find_other_axes(mine, theirs, None if estimate.sd_rph is None else estimate.sd_rph[:, 2])
-    notes += find_other_heights(p[:, 2])
 
+def _subtract_attitudes(estimate: Trajectory, seen: Trajectory, notes: Notes) -> tuple[Array, Array]:
+    """Roll, pitch and heading (N, 3) of the estimate minus the truth's, and the rotation vector (N, 3) between them.
+
+    By the rotation, not the angles: these are strongly nonlinear where a foot points down.
+    """
+    if estimate.rph is None or seen.rph is None:
+        missing = np.full((len(seen), 3), np.nan)
+        return missing, missing
+    mine, theirs = rotation.from_rph(estimate.rph), rotation.from_rph(seen.rph)
+    notes += find_other_axes(mine, theirs, None if estimate.sd_rph is None else estimate.sd_rph[:, 2])
+    return rotation.wrap(estimate.rph - seen.rph), rotation.log(np.swapaxes(mine, -1, -2) @ theirs)
+
+
+def _find_covariance(estimate: Trajectory, seen: Trajectory, from_start: bool, notes: Notes) -> Array:
+    """The covariance (N, 9, 9) of the errors, to which the sigmas of the truth are added; NaN where unknown."""
     cov = fill_covariance(estimate)
     cov = np.full((len(seen), 9, 9), np.nan) if cov is None else cov
     if from_start:
         cov = _subtract_fit(cov, estimate, notes)
     of_truth = fill_covariance(replace(seen, covariance=None))
-    if of_truth is not None:
-        cov = cov + np.nan_to_num(of_truth)
-    dof = 2 if flat else 3
-    nees_rph = missing[:, 0]
-    if estimate.rph is not None:
-        to_theta = np.linalg.inv(rotation.rph_jacobian(estimate.rph))
-        nees_rph = _compute_nees(theta, to_theta @ cov[:, 6:9, 6:9] @ np.swapaxes(to_theta, -1, -2))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        per_axis = p**2 / np.diagonal(cov, axis1=-2, axis2=-1)[:, :3]
-    if truth.v is None:
-        notes.add("truth.no_velocity", "the truth has no velocity: its direction of travel is taken from its positions")
+    return cov if of_truth is None else cov + np.nan_to_num(of_truth)
+
+
+def _turn_along_track(p: Array, travel: Array) -> Array:
+    """Errors (N, 2) along the horizontal velocity `travel` (N, 2) m/s, and to its right; NaN where it is slow."""
     speed = np.linalg.norm(travel, axis=1)
     moving = speed > _LEAST_SPEED
     along = np.where(moving[:, None], travel / np.where(moving, speed, 1.0)[:, None], np.nan)
-    return Errors(
-        t=seen.t,
-        p=p,
-        track=np.column_stack(
-            [p[:, 0] * along[:, 0] + p[:, 1] * along[:, 1], p[:, 0] * along[:, 1] - p[:, 1] * along[:, 0]]
-        ),
-        v=v,
-        rph=rph,
-        sd_p=missing if estimate.sd_p is None else estimate.sd_p,
-        sd_v=missing if estimate.sd_v is None else estimate.sd_v,
-        sd_rph=missing if estimate.sd_rph is None else estimate.sd_rph,
-        nees_p=_compute_nees(p[:, :dof], cov[:, :dof, :dof]),
-        nees_axis=np.where(np.isfinite(per_axis), per_axis, np.nan),
-        nees_v=_compute_nees(v, cov[:, 3:6, 3:6]),
-        nees_rph=nees_rph,
-        distance=measure_distance(seen.t, seen.llh),
-        dof_p=dof,
-        epochs=epochs,
-        notes=tuple(dict.fromkeys(notes)),
-        nees_heading=_compute_nees(rph[:, 2:], cov[:, 8:, 8:]),
+    return np.column_stack(
+        [p[:, 0] * along[:, 0] + p[:, 1] * along[:, 1], p[:, 0] * along[:, 1] - p[:, 1] * along[:, 0]]
     )
 
 
@@ -275,6 +290,14 @@ def _compute_nees(e: Array, cov: Array) -> Array:
     rows, unit, w = rows[good], unit[good], (e[rows] / sd)[good]
     out[rows] = np.sum(w * np.linalg.solve(unit, w[..., None])[..., 0], axis=1)
     return out
+
+
+def _compute_attitude_nees(theta: Array, estimate: Trajectory, cov: Array) -> Array:
+    """NEES (N,) of the rotation vectors (N, 3), whose covariance is that of roll, pitch and heading, turned."""
+    if estimate.rph is None:
+        return np.full(len(theta), np.nan)
+    to_theta = np.linalg.inv(rotation.rph_jacobian(estimate.rph))
+    return _compute_nees(theta, to_theta @ cov[:, 6:9, 6:9] @ np.swapaxes(to_theta, -1, -2))
 
 
 def _explain_no_overlap(trajectory: Trajectory, truth: Trajectory, max_gap: float) -> str:

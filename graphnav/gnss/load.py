@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -110,33 +111,13 @@ def load_raw(
         obs = restore_own_stamps(obs, precise or nav, rover, corrected)  # type: ignore[arg-type]
     raw, remarks = place(obs, nav, precise, rover, corrected)
     raw, contradictory = drop_contradictory(raw)
-    remarks += contradictory
-    antennas: Antennas = {}
-    for path in sources.antex:
-        some, ends = read_antex(path)
-        antennas |= some
-        remarks += ends
+    antennas, ends = _read_antennas(sources.antex)
+    remarks = (*remarks, *contradictory, *ends)
     raw = replace(
         raw, lever_arm=np.array(sources.lever_arm), precise=precise is not None, antennas=antennas if precise else {},
         clock_noise=precise.compute_clock_noise() if precise else {},
     )  # fmt: skip
-    one = choose_primary(raw) & np.isfinite(raw.p[:, 0])
-    if not one.any():
-        raise RecordingError(
-            f"{sources.rover[0]}: none of its satellites has an ephemeris at its times", key="raw.no_ephemeris_then"
-        )
-    fixes = solve(raw.take(one))
-    if not np.isfinite(fixes.p[:, 0]).any():
-        left_out = "".join(f"; {note}" for note in (*obs.remarks, *remarks) if get_key(note) in _LOST_KEYS)
-        for signal in np.unique(obs.signal).tolist():
-            if (typical := float(np.nanmedian(obs.code[obs.signal == signal]))) > _LARGEST_TYPICAL_CODE:
-                left_out += (
-                    f"; codes {name_signal(signal)} of {typical:.3g} m are no ranges to satellites: see the header"
-                )
-        raise RecordingError(
-            f"{sources.rover[0]}: no epoch has enough satellites for a position{left_out}", key="raw.few_satellites"
-        )
-    _check_agreement(raw.take(one), fixes, sources.rover[0])
+    fixes = _solve_primary(raw, obs, remarks, sources.rover[0])
     notes = Notes([*obs.remarks, *remarks])
     if raw.klobuchar is None:
         notes.add(
@@ -156,6 +137,45 @@ def load_raw(
             better = raw.take(one)
             fixes = solve(replace(better, code=better.code + better.difference), differential=True)
     return raw, fixes, tuple(notes)
+
+
+def _read_antennas(paths: Sequence[Path]) -> tuple[Antennas, list[str]]:
+    """The satellites' antennas of ANTEX files, and remarks."""
+    antennas: Antennas = {}
+    remarks: list[str] = []
+    for path in paths:
+        some, ends = read_antex(path)
+        antennas |= some
+        remarks += ends
+    return antennas, remarks
+
+
+def _solve_primary(raw: RawGnss, obs: Observations, remarks: Sequence[str], path: Path) -> SinglePoint:
+    """Single-point solutions by one signal of each satellite.
+
+    Raises
+    ------
+    RecordingError
+        If there is none, for a reason in `remarks` on the observations where they tell it, or if most codes disagree.
+    """
+    one = choose_primary(raw) & np.isfinite(raw.p[:, 0])
+    if not one.any():
+        raise RecordingError(
+            f"{path}: none of its satellites has an ephemeris at its times", key="raw.no_ephemeris_then"
+        )
+    fixes = solve(raw.take(one))
+    if not np.isfinite(fixes.p[:, 0]).any():
+        left_out = "".join(f"; {note}" for note in (*obs.remarks, *remarks) if get_key(note) in _LOST_KEYS)
+        for signal in np.unique(obs.signal).tolist():
+            if (typical := float(np.nanmedian(obs.code[obs.signal == signal]))) > _LARGEST_TYPICAL_CODE:
+                left_out += (
+                    f"; codes {name_signal(signal)} of {typical:.3g} m are no ranges to satellites: see the header"
+                )
+        raise RecordingError(
+            f"{path}: no epoch has enough satellites for a position{left_out}", key="raw.few_satellites"
+        )
+    _check_agreement(raw.take(one), fixes, path)
+    return fixes
 
 
 def _read_ephemerides(paths: tuple[Path, ...]) -> Ephemerides | None:

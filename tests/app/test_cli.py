@@ -535,7 +535,7 @@ def _raise_from(error: Exception, cause: BaseException) -> Exception:
     [
         (KeyboardInterrupt(), 130, "interrupted"),
         (_raise_from(ImportError("initialization failed"), KeyboardInterrupt()), 130, "interrupted"),
-        (TypeError("what\nis this"), 1, "internal error: TypeError: what is this in cli_solve.py:"),
+        (TypeError("what\nis this"), 1, "internal error: TypeError: what is this in solving.py:"),
         (MemoryError(), 1, "out of memory"),
         (OSError(28, "No space left on device", "o/summary.json"), 2, "o/summary.json: No space left on device"),
     ],
@@ -564,7 +564,7 @@ def test_an_end_of_a_file_is_not_taken_for_ctrl_c(tmp_path, monkeypatch, capsys)
 
     monkeypatch.setattr(workflow, "run_request", failing)
     assert cli.run(["smooth", "kitti", "-o", str(tmp_path / "o")]) == 1
-    assert "internal error: EOFError: cut short in cli_solve.py:" in capsys.readouterr().err
+    assert "internal error: EOFError: cut short in solving.py:" in capsys.readouterr().err
 
 
 def test_a_reader_that_stops_early_is_no_error():

@@ -19,6 +19,7 @@ from graphnav.app import cli
 from graphnav.core.timescales import unix_to_gps
 from graphnav.recording.draft import draft
 from graphnav.recording.draft.clocks import read_clock_seconds, read_serial_days
+from graphnav.recording.draft.logs import read_log
 from graphnav.recording.formats import read
 from graphnav.recording.formats.table import read_table
 
@@ -193,10 +194,19 @@ def test_a_course_in_radians_is_told_by_the_positions(plain, tmp_path):
         ("lat,lon,height,hAcc,vAcc,velN,velE,velD", (1e7, 1e7, *[1e3] * 6), "v"),  # as u-blox
         ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e5, 1e5, 1e5), ""),  # in no unit
         ("lat,lon,hMSL [mm],hacc_mm,vacc_mm,velN_mm_s,velE_mm_s,velD_mm_s", (1, 1, 1e3, *[1e3] * 5), "v"),
+        ("lat,lon,alt_mm,hacc_mm,vacc_mm,velN_mm_s,velE_mm_s,velD_mm_s", (1e7, 1e7, *[1e3] * 6), "v"),
         ("lat,lon,alt,NedVelX,NedVelY,NedVelZ", (1,) * 6, "v"),
         ("lat,lon,alt,vx,heading", (1,) * 5, ""),  # of which axes is not said: no speed along the heading
     ],
-    ids=["whole degrees", "whole degrees and mm", "no unit", "millimetres", "axes in the name", "axes unknown"],
+    ids=[
+        "whole degrees",
+        "whole degrees and mm",
+        "no unit",
+        "millimetres",
+        "whole degrees and stated mm",
+        "axes in the name",
+        "axes unknown",
+    ],
 )
 def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, scales, more):
     imu, (_, rows) = plain
@@ -217,6 +227,15 @@ def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, 
         assert gnss.v == pytest.approx(np.column_stack([east, north, moves[:, 2]]), abs=rounded)
     if "acc" in names.lower():
         assert gnss.sd == pytest.approx(np.full((len(t), 3), 0.03))
+
+
+def test_each_conversion_of_a_table_is_noted(tmp_path):
+    stamps = [f"{100000 + 100 * (k // 60) + k % 60}" for k in range(150)]
+    rows = [f"{t};{3540.0 + 1e-3 * k:.5f};{13946.0 + 1e-3 * k:.5f};40" for k, t in enumerate(stamps)]
+    (tmp_path / "gnss.csv").write_text("\n".join(["utc;latitude;longitude;height", *rows]) + "\n")
+    found = read_log(tmp_path / "gnss.csv")["gnss"]
+    np.testing.assert_allclose(np.diff(found.t), 1.0)
+    assert all(f"'{name}'" in found.plain.words for name in ("utc", "latitude", "longitude"))
 
 
 def test_first_rows_in_which_little_is_known_are_no_header(plain, tmp_path):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.core.findings import SEVERITIES, Finding, compute_period, find_gap_limit, find_runs
+from graphnav.core.findings import SEVERITIES, Finding, compute_period
 from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.recording import Recording
@@ -32,6 +32,8 @@ from graphnav.recording.checks.axes import (
     turns_against,
 )
 from graphnav.recording.checks.clock import measure_clock_offsets
+from graphnav.recording.checks.crosschecks import Fit
+from graphnav.recording.checks.facts import format_facts, list_facts
 from graphnav.recording.checks.imu import (
     check_foot_rate,
     check_force_at_rest,
@@ -42,8 +44,8 @@ from graphnav.recording.checks.imu import (
     check_saturation,
 )
 from graphnav.recording.checks.places import check_frozen, check_height_unit, check_mirroring, find_mirrored
-from graphnav.recording.checks.raw import check_raw, describe_raw
-from graphnav.recording.checks.series import check_series, describe_series
+from graphnav.recording.checks.raw import check_raw
+from graphnav.recording.checks.series import check_series
 from graphnav.recording.checks.stated import (
     check_fix_types,
     check_lever_arms,
@@ -126,32 +128,36 @@ class Inspection:
         """
         lines = [f"{self.name} ({self.platform})"]
         for sensor, facts in self.facts.items():
-            lines.append(f"  {sensor:<9} {', '.join(_format_numbers(facts))}")
+            lines.append(f"  {sensor:<9} {', '.join(format_facts(facts))}")
         for finding in self.findings:
             lines.append(f"  {finding.severity}: {finding.sentence}")
         return "\n".join(lines)
 
 
-_VALUE_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2", "dbhz": "dB-Hz"}
+@dataclass(frozen=True)
+class _Evidence:
+    """What several checks judge by."""
+
+    recording: Recording  # without impossible rows, and without sensors that are then empty
+    known: frozenset[str]  # keys of what screening has found
+    track: Track | None  # by the fixes, as they are
+    overlap: bool  # whether fixes and IMU share some time
+    rest: Array  # (N,) which rows of the IMU are at rest
+    wrong: tuple[Finding, ...]  # of positions and velocities that contradict each other
+
+    @property
+    def vehicle(self) -> bool:
+        """Whether this is no walk."""
+        return self.recording.platform == "vehicle"
 
 
-def _format_numbers(facts: dict[str, Any]) -> Iterator[str]:
-    """Each fact with its name, of which words that the name before begins with too are not repeated."""
-    before = ""
-    for name, value in facts.items():
-        words, said = name.split("_"), before.split("_")
-        common = next((k for k, (a, b) in enumerate(zip(words[:-1], said, strict=False)) if a != b), len(words) - 1)
-        yield _format_number("_".join(words[min(common, len(words) - 1) :]) if len(said) > 1 else name, value)
-        before = name
+@dataclass(frozen=True)
+class _Motion:
+    """How a vehicle moves by its fixes, and how the IMU fits that."""
 
-
-def _format_number(name: str, value: Any) -> str:
-    if isinstance(value, dict):
-        return ", ".join(_format_number(*one) for one in value.items())
-    words = name.split("_")
-    unit = _VALUE_UNITS.get(words[-1], "") if len(words) > 1 else ""
-    number = f"{value:.6g}" if isinstance(value, float) else str(value)
-    return f"{' '.join(words[:-1] if unit else words)} {number} {unit}".rstrip()
+    track: Track
+    yaw: Fit | None  # changes of course on the gyro
+    forward: Fit | None  # changes of speed on the force
 
 
 def inspect(recording: Recording, screened: Screened | None = None) -> Inspection:
@@ -170,136 +176,128 @@ def inspect(recording: Recording, screened: Screened | None = None) -> Inspectio
         Facts by sensor, the recording without impossible rows, and findings: the most severe first, then in the
         order of the checks, beginning with the loader's remarks.
     """
-    stamps, whole = recording.imu, screened or screen(recording)
-    recording = whole.recording
-    findings = [Finding("note", remark, get_key(remark) or "recording.remark") for remark in recording.remarks]
-    findings += whole.findings
-    for name, sensor in recording.aiding.items():
-        if not len(sensor.t):
-            findings.append(
-                Finding("warning", f"[{name}] holds no rows in this part of the recording", f"{name}.empty")
-            )
-            recording = recording.without(name)
-    known = {f.key for f in whole.findings}
-    facts: dict[str, dict[str, Any]] = {"imu": _describe_imu(recording)}
-    vehicle = recording.platform == "vehicle"
-    overlap = recording.gnss is not None and measure_common_time(recording) > 0
-    track = tracks.compute_track(recording.gnss) if recording.gnss is not None else None
-    rest = _find_rest(recording, track if overlap else None)
-    findings += check_imu_time(stamps)  # rows left out have been reported already
-    findings += check_repeats(recording.imu, track if overlap else None)
-    findings += check_saturation(recording.imu)
-    findings += check_foot_rate(recording)
-    if "imu.gyro_unit" not in known:
-        findings += check_gyro_unit(recording)
-    findings += check_stated_noise(recording.imu.noise)
-    findings += check_lever_arms(recording)
-    findings += [] if "imu.force_scale" in known else check_platform(recording, track)
-    if rest.any():
-        facts["imu"]["still_s"] = float(rest.sum() * compute_period(recording.imu.t))
-        findings += check_force_at_rest(recording, rest, facts["imu"])
-        if vehicle:  # a standing person sways
-            findings += check_noise_at_rest(recording.imu, rest)
-    if recording.gnss is not None:
-        facts["gnss"] = _describe_gnss(recording, track)
-        findings += check_gnss_coverage(recording)
-        findings += check_rounding(recording.gnss)
-        findings += check_frozen(recording)
-        findings += check_fix_types(recording.gnss)
-        wrong = find_mirrored(recording, list(check_velocities(recording.gnss)))
-        if overlap or not wrong:
-            # against wrong velocities, or on another clock, every position would jump
-            findings += wrong or (check_gnss_jumps(recording, track) if overlap else ())
-    if recording.raw_gnss is not None and len(recording.raw_gnss):
-        facts["raw_gnss"] = describe_raw(recording.raw_gnss)
-        findings += check_raw(recording.raw_gnss)
-    # with wrong axes, or forces without gravity, this test does not apply
-    turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis", "imu.force_scale"}
-    # otherwise the turn rate about the vertical is unknown as well
-    upright = not known & {"imu.force_scale", "imu.dead_axis"}
-    if vehicle and overlap and track is not None and recording.gnss is not None and upright:
-        clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
-        yaw = whole.yaw or crosschecks.fit_yaw_rate(recording.imu, track)
-        if any(
-            f.key in ("gnss.velocity_axes", "gnss.velocity_unit") for f in wrong
-        ):  # their comparison with the IMU is meaningless
-            track = tracks.compute_track(replace(recording.gnss, v=None)) or track
-            yaw = crosschecks.fit_yaw_rate(recording.imu, track)
-        forward = clock.by_velocity if track.instant else clock.by_places
-        turns_back = turns_against(yaw)
-        turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back
-        if not turns_so and (mirrored := list(check_mirroring(recording, track, turns_back))):
-            findings += mirrored
-        elif not turned:
-            if turns_back:
-                findings += check_gyro_sign(recording.imu, track)
-            else:
-                wrong = list(check_imu_axes(recording.imu, forward, track))
-                wrong = wrong or list(check_sideways(recording.imu, forward, track, yaw))
-                findings += wrong or check_gyro_tilt(recording.imu, track)
-            findings += [] if "imu.gyro_unit" in known else check_yaw_scale(yaw)
-            findings += check_height_unit(recording, track, forward)
-    elif vehicle and not turned:
-        findings += check_imu_axes(recording.imu, None, None)
-    if recording.odometer is not None:
-        facts["odometer"] = _describe_sensors(recording.odometer.t)
-        step, speed = np.diff(recording.odometer.t), np.abs(recording.odometer.speed)
-        facts["odometer"]["distance_m"] = round(float(np.sum(0.5 * (speed[1:] + speed[:-1]) * step)), 1)
-        facts["odometer"]["max_speed_mps"] = float(np.abs(recording.odometer.speed).max())
-        findings += check_odometer(recording, track, facts["odometer"])
-    facts |= {name: describe_series(series) for name, series in recording.sensors.items()}
-    findings += check_series(recording)
-    if recording.truth is not None:
-        facts["truth"] = {"rows": len(recording.truth.t), "of": str(recording.truth.of)}
-        if recording.truth.closed_loop_sigma:
-            facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
-        findings += check_truth(recording)
-    if any(f.severity != "note" for f in findings) and not recording.has_keys:
+    whole = screened or screen(recording)
+    used, empty = _leave_out_empty(whole.recording)
+    evidence = _gather_evidence(used, whole)
+    motion = _fit_motion(evidence, whole)
+    facts = list_facts(used, evidence.track)
+    findings = [
+        *(Finding("note", remark, get_key(remark) or "recording.remark") for remark in whole.recording.remarks),
+        *whole.findings,
+        *empty,
+        *check_imu_time(recording.imu),  # rows left out have been reported already
+        *_check_imu(evidence, facts["imu"]),
+        *_check_fixes(evidence),
+        *(check_raw(used.raw_gnss) if used.raw_gnss is not None and len(used.raw_gnss) else ()),
+        *_check_motion(evidence, motion),
+    ]
+    if used.odometer is not None:
+        findings += check_odometer(used, evidence.track if motion is None else motion.track, facts["odometer"])
+    findings += check_series(used)
+    if used.truth is not None:
+        findings += check_truth(used)
+    if any(f.severity != "note" for f in findings) and not used.has_keys:
         findings.append(
             Finding(
                 "note",
                 "keys in brackets belong in a recording.toml, which this log does not have: graphnav init "
-                f"{recording.source} drafts one",
+                f"{used.source} drafts one",
                 "recording.log",
             )
         )
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
-    return Inspection(recording.name, recording.platform, facts, whole.recording, tuple(findings))
+    return Inspection(used.name, used.platform, facts, whole.recording, tuple(findings))
 
 
-def _describe_sensors(t: Array) -> dict[str, Any]:
-    return {"rows": len(t), "rate_hz": round(1.0 / compute_period(t), 3), "span_s": round(float(t[-1] - t[0]), 3)}
+def _leave_out_empty(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """The recording without sensors that hold no rows, and a warning for each."""
+    empty = [name for name, sensor in recording.aiding.items() if not len(sensor.t)]
+    for name in empty:
+        recording = recording.without(name)
+    words = "holds no rows in this part of the recording"
+    return recording, [Finding("warning", f"[{name}] {words}", f"{name}.empty") for name in empty]
 
 
-def _describe_imu(recording: Recording) -> dict[str, Any]:
-    facts = _describe_sensors(recording.imu.t)
-    facts["duration_s"] = round(recording.duration, 3)
-    step = np.diff(recording.imu.t)
-    facts["gaps"] = int((step > find_gap_limit(recording.imu.t)).sum())
-    facts["longest_step_s"] = round(float(step.max()), 4)
-    return facts
-
-
-def _describe_gnss(recording: Recording, track: Track | None) -> dict[str, Any]:
+def _gather_evidence(recording: Recording, whole: Screened) -> _Evidence:
     gnss = recording.gnss
-    assert gnss is not None
-    facts: dict[str, Any] = {"rows": 1} if len(gnss.t) == 1 else _describe_sensors(gnss.t)
-    facts["velocities"] = 0 if gnss.v is None else int((~np.isnan(gnss.v[:, 0])).sum())
-    if gnss.types:
-        facts["types"] = gnss.types
-    if track is not None:
-        dt = np.diff(track.t)
-        near = dt < 5 * max(1.0, track.period)
-        usable = track.speed < 100.0
-        speed = track.speed
-        distance = np.sum((0.5 * (speed[1:] + speed[:-1]) * dt)[near])
-        facts["distance_m"] = round(float(distance), 1)
-        facts["max_speed_mps"] = round(float(np.percentile(speed[usable], 99.9)), 2) if usable.any() else float("nan")
-        stopped = find_runs(speed < 0.3)
-        stops = [(a, b) for a, b in stopped if track.t[b - 1] - track.t[a] >= 2.0]
-        facts["stops"] = len(stops)
-        facts["stopped_s"] = round(float(sum(track.t[b - 1] - track.t[a] for a, b in stops)), 1)
-    return facts
+    overlap = gnss is not None and measure_common_time(recording) > 0
+    track = tracks.compute_track(gnss) if gnss is not None else None
+    wrong = find_mirrored(recording, list(check_velocities(gnss))) if gnss is not None else ()
+    rest = _find_rest(recording, track if overlap else None)
+    return _Evidence(recording, frozenset(f.key for f in whole.findings), track, overlap, rest, tuple(wrong))
+
+
+def _fit_motion(evidence: _Evidence, whole: Screened) -> _Motion | None:
+    """The motion by the fixes; None on foot, without fixes, or where the IMU cannot tell the vertical."""
+    gnss, imu, track = evidence.recording.gnss, evidence.recording.imu, evidence.track
+    upright = not evidence.known & {"imu.force_scale", "imu.dead_axis"}
+    if not (evidence.vehicle and evidence.overlap and upright) or gnss is None or track is None:
+        return None
+    clock = whole.clock or measure_clock_offsets(imu, gnss)
+    yaw = whole.yaw or crosschecks.fit_yaw_rate(imu, track)
+    if any(f.key in ("gnss.velocity_axes", "gnss.velocity_unit") for f in evidence.wrong):
+        # the comparison of such velocities with the IMU is meaningless
+        track = tracks.compute_track(replace(gnss, v=None)) or track
+        yaw = crosschecks.fit_yaw_rate(imu, track)
+    return _Motion(track, yaw, clock.by_velocity if track.instant else clock.by_places)
+
+
+def _check_imu(evidence: _Evidence, facts: dict[str, Any]) -> Iterator[Finding]:
+    """Checks of the IMU by itself and at rest, and of stated figures; `facts` of the rest are added."""
+    recording, imu, known = evidence.recording, evidence.recording.imu, evidence.known
+    yield from check_repeats(imu, evidence.track if evidence.overlap else None)
+    yield from check_saturation(imu)
+    yield from check_foot_rate(recording)
+    if "imu.gyro_unit" not in known:
+        yield from check_gyro_unit(recording)
+    yield from check_stated_noise(imu.noise)
+    yield from check_lever_arms(recording)
+    if "imu.force_scale" not in known:
+        yield from check_platform(recording, evidence.track)
+    if evidence.rest.any():
+        facts["still_s"] = float(evidence.rest.sum() * compute_period(imu.t))
+        yield from check_force_at_rest(recording, evidence.rest, facts)
+        if evidence.vehicle:  # a standing person sways
+            yield from check_noise_at_rest(imu, evidence.rest)
+
+
+def _check_fixes(evidence: _Evidence) -> Iterator[Finding]:
+    """Checks of the fixes by themselves."""
+    recording, gnss = evidence.recording, evidence.recording.gnss
+    if gnss is None:
+        return
+    yield from check_gnss_coverage(recording)
+    yield from check_rounding(gnss)
+    yield from check_frozen(recording)
+    yield from check_fix_types(gnss)
+    # against wrong velocities, or on another clock, every position would jump
+    if evidence.overlap:
+        yield from evidence.wrong or check_gnss_jumps(recording, evidence.track)
+
+
+def _check_motion(evidence: _Evidence, motion: _Motion | None) -> Iterator[Finding]:
+    """Checks of the IMU's axes, signs and scale, and of positions, against the drive."""
+    recording, imu = evidence.recording, evidence.recording.imu
+    # with wrong axes, or forces without gravity, the axes are not judged again
+    turned = evidence.known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis", "imu.force_scale"}
+    if motion is None:
+        if evidence.vehicle and not turned:
+            yield from check_imu_axes(imu, None, None)
+        return
+    track, yaw, forward = motion.track, motion.yaw, motion.forward
+    turns_back = turns_against(yaw)
+    turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back
+    if not turns_so and (mirrored := list(check_mirroring(recording, track, turns_back))):
+        yield from mirrored
+    elif not turned:
+        if turns_back:
+            yield from check_gyro_sign(imu, track)
+        else:
+            wrong = list(check_imu_axes(imu, forward, track)) or list(check_sideways(imu, forward, track, yaw))
+            yield from wrong or check_gyro_tilt(imu, track)
+        if "imu.gyro_unit" not in evidence.known:
+            yield from check_yaw_scale(yaw)
+        yield from check_height_unit(recording, track, forward)
 
 
 def _find_rest(recording: Recording, track: Track | None) -> Array:

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import NEAR, UNIX, ClockOffset, compute_clock_offset
@@ -18,7 +16,6 @@ from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, LIKELY, Agreement, compare_with_fixes
 from graphnav.recording.draft.document import Document, format_vector
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.logs import Source
 from graphnav.recording.draft.raw import RawFound, find_raw, write_raw
 from graphnav.recording.draft.references import has_attitude, is_above_sea
 from graphnav.recording.draft.sources import (
@@ -27,6 +24,7 @@ from graphnav.recording.draft.sources import (
     guess_fix_speed_unit,
     read_fixes,
 )
+from graphnav.recording.draft.tables import VELOCITIES, Source
 from graphnav.recording.formats.schema import FORCE, RATE_UNITS, SPEED
 from graphnav.recording.formats.writer import quote
 
@@ -221,66 +219,31 @@ class _Writer:
 
     def _write_gnss(self, source: Source, agreement: Agreement) -> None:
         self.file.begin("gnss")
-        values = source.values
         late = agreement.late_velocity
-        dropped = ("ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course") if late is not None else ()
-        numbers = None
-        if "type" in values:
-            sd = values.get("sd_e")
-            numbers = guesses.guess_fix_numbers(values["type"], sd)
-            theirs = source.columns.names["type"]
-            if numbers.value is None and theirs != "type":
-                dropped = (*dropped, "type")
-                self.file.decide(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
-        missing = {"sd_e", "sd_n", "sd_u"} - values.keys()
-        if missing == {"sd_u"}:
-            theirs = source.columns.names["sd_e"]
-            self.file.decide(f"sigmas: '{theirs}' is that of each horizontal axis, heights twice as uncertain")
-            missing = set()
-        if missing:  # all three or none
-            dropped = (*dropped, "sd_e", "sd_n", "sd_u")
+        numbers = self._choose_type_numbers(source)
+        missing = self._list_missing_sigmas(source)
         if source.log is None and has_attitude(source):
             self.file.decide(
                 f"CHECK: {source.path.name} has attitude: an INS's estimates, whose errors last, not fixes"
             )
-        height = source.columns.names.get("h", "")
-        of_sea = is_above_sea(height)
-        if "geoid" in values:
-            pair = f"'{height}' and '{source.columns.names['geoid']}'"
-            same = (source.find_unit("h", "length") or "m") == (source.find_unit("geoid", "length") or "m")
-            if of_sea and same:
-                self.file.decide(f"heights: above the ellipsoid, as {pair} add up")
-            else:
-                dropped = (*dropped, "geoid")
-                why = "one is not in the other's unit" if of_sea else "a height above the ellipsoid needs none"
-                self.file.decide(f"heights: CHECK: {pair} are not added up: {why}")
+        added = self._choose_geoid(source)
+        dropped = (
+            *(VELOCITIES if late is not None else ()),
+            *(("type",) if numbers is None else ()),
+            *(("sd_e", "sd_n", "sd_u") if missing else ()),  # all three or none
+            *(() if added else ("geoid",)),
+        )
         self.file.write_file(source, "gnss", dropped)
         if source.log is None:
-            if "h" not in values:
-                raise RecordingError(
-                    f"{source.path}: no column of heights beside {source.columns.names['lat']}: add a column h, "
-                    "in m; one height throughout, that of the place, is given a large sigma",
-                    key="draft.no_heights",
-                )
-            units = {"t": source.t_unit}
-            if numbers is not None and numbers.value is not None:
-                units["type"] = numbers
-            if source.radians:
-                units["angle"] = Guess("rad", "lat and lon are all small enough")
-            if source.find_unit("h", "length") == "ft":
-                units["height"] = Guess("ft", "as the column's name says")
-            if {"speed", "course"} <= values.keys() and "ve" not in values and late is None:
-                units["speed"] = guess_fix_speed_unit(source)
-            elif stated := source.find_unit("ve", "speed"):
-                units["speed"] = Guess(stated, "as the column's name says")
-            self.file.write_units(units)
+            self._write_fix_units(source, numbers, late)
             if missing:
                 none = "none" if len(missing) == 3 else "none of all three"
                 why = (
                     f"CHECK: m, 1-sigma east, north, up; the file states {none}, this is a receiver without corrections"
                 )
                 self.file.write_key("sd", _SD, why)
-            if of_sea and ("geoid" not in values or "geoid" in dropped):
+            height = source.columns.names["h"]
+            if is_above_sea(height) and not added:
                 self.file.decide(f"heights: '{height}' may be above mean sea level; they are used as they are")
         if late is not None:
             words = f"velocities are not used: they come {late:.2f} s after the positions"
@@ -290,6 +253,64 @@ class _Writer:
             source.log.gnss if source.log else None, "from the IMU to the antenna: right, forward, up"
         )
         self._write_time_offset(agreement)
+
+    def _choose_type_numbers(self, source: Source) -> Guess | None:
+        """The numbers of the types of fixes; None where a column is not surely of types, or there is none."""
+        if "type" not in source.values:
+            return None
+        numbers = guesses.guess_fix_numbers(source.values["type"], source.values.get("sd_e"))
+        theirs = source.columns.names["type"]
+        if numbers.value is None and theirs != "type":
+            self.file.decide(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
+            return None
+        return numbers
+
+    def _list_missing_sigmas(self, source: Source) -> set[str]:
+        """The sigmas of positions that are not in the file and do not follow from those that are."""
+        missing = {"sd_e", "sd_n", "sd_u"} - source.values.keys()
+        if missing != {"sd_u"}:
+            return missing
+        theirs = source.columns.names["sd_e"]
+        self.file.decide(f"sigmas: '{theirs}' is that of each horizontal axis, heights twice as uncertain")
+        return set()
+
+    def _choose_geoid(self, source: Source) -> bool:
+        """Whether heights of the geoid are added to those above the sea."""
+        if "geoid" not in source.values:
+            return False
+        height = source.columns.names.get("h", "")
+        pair = f"'{height}' and '{source.columns.names['geoid']}'"
+        of_sea = is_above_sea(height)
+        if of_sea and (source.find_unit("h", "length") or "m") == (source.find_unit("geoid", "length") or "m"):
+            self.file.decide(f"heights: above the ellipsoid, as {pair} add up")
+            return True
+        why = "one is not in the other's unit" if of_sea else "a height above the ellipsoid needs none"
+        self.file.decide(f"heights: CHECK: {pair} are not added up: {why}")
+        return False
+
+    def _write_fix_units(self, source: Source, numbers: Guess | None, late: float | None) -> None:
+        """Write the units of a table's columns of fixes, whose velocities come `late` s after the positions, if so.
+
+        Raises
+        ------
+        RecordingError
+            If it has no heights.
+        """
+        if "h" not in source.values:
+            raise RecordingError(
+                f"{source.path}: no column of heights beside {source.columns.names['lat']}: add a column h, "
+                "in m; one height throughout, that of the place, is given a large sigma",
+                key="draft.no_heights",
+            )
+        units = {"t": source.t_unit}
+        if numbers is not None and numbers.value is not None:
+            units["type"] = numbers
+        units |= _list_place_units(source)
+        if {"speed", "course"} <= source.values.keys() and "ve" not in source.values and late is None:
+            units["speed"] = guess_fix_speed_unit(source)
+        elif stated := source.find_unit("ve", "speed"):
+            units["speed"] = Guess(stated, "as the column's name says")
+        self.file.write_units(units)
 
     def _write_time_offset(self, agreement: Agreement) -> None:
         """Write what is to be added to the stamps of the fixes, if that is seen."""
@@ -314,10 +335,11 @@ class _Writer:
                 source.t, source.values["speed"], course, source.find_unit("speed", "speed")
             )
             self.file.write_units({"t": source.t_unit, "speed": speed})
-            lag = _find_odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
+            lag = motion.find_odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
             if lag is not None and lag.correlation > LIKELY and abs(lag.seconds) > _SMALL:
                 sure = "" if lag.correlation > CLEAR else "CHECK: "
-                self.file.write_key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_describe_agreement(lag)}")
+                why = f"the accelerations agree best with the IMU's so (coherence {lag.correlation:.2f})"
+                self.file.write_key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {why}")
                 self.file.write_key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
         self.file.write_lever_arm(
             source.log.odometer if source.log else None, "from the IMU to the middle of the rear axle"
@@ -333,11 +355,7 @@ class _Writer:
     def _write_truth(self, source: Source, imu: Source, fixes: bool) -> None:
         self.file.begin("truth")
         self.file.write_file(source, "truth")
-        units = {"t": source.t_unit}
-        if source.radians:
-            units["angle"] = Guess("rad", "lat and lon are all small enough")
-        if source.find_unit("h", "length") == "ft":
-            units["height"] = Guess("ft", "as the column's name says")
+        units = {"t": source.t_unit, **_list_place_units(source)}
         if stated := source.find_unit("ve", "speed"):
             units["speed"] = Guess(stated, "as the column's name says")
         self.file.write_units(units)
@@ -353,14 +371,14 @@ class _Writer:
             self.file.write_key("time_offset", f"{epochs.offset:.2f}", f"s; {epochs.words}")
 
 
-def _find_odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> motion.Lag | None:
-    """Delay of the wheel speed, by its accelerations against the forward ones of the IMU."""
-    if len(t) < 50:
-        return None
-    grid, forward = motion.resample_on_grid(felt[0], felt[1][:, None])
-    even = np.arange(t[0], t[-1], motion.GRID)
-    pull = np.gradient(motion.compute_moving_mean(np.interp(even, t, speed)), motion.GRID)
-    return motion.find_lag(grid, motion.filter_band(forward[:, 0]), even, motion.filter_band(pull))
+def _list_place_units(source: Source) -> dict[str, Guess]:
+    """Units of positions other than deg and m."""
+    units = {}
+    if source.radians:
+        units["angle"] = Guess("rad", "lat and lon are all small enough")
+    if source.find_unit("h", "length") == "ft":
+        units["height"] = Guess("ft", "as the column's name says")
+    return units
 
 
 def _find_epoch(imu: Source, other: Source) -> ClockOffset | None:
@@ -372,7 +390,3 @@ def _find_epoch(imu: Source, other: Source) -> ClockOffset | None:
 
 def _read_first(source: Source, sensor: str) -> float:
     return float((source.t if source.log is None else getattr(source.log, sensor).t)[0])
-
-
-def _describe_agreement(lag: motion.Lag) -> str:
-    return f"the accelerations agree best with the IMU's so (coherence {lag.correlation:.2f})"

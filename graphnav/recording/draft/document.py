@@ -12,8 +12,8 @@ from graphnav.core.files import is_inside
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Odometer
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.logs import Source
 from graphnav.recording.draft.sources import JOINED, name_plain_file
+from graphnav.recording.draft.tables import Source
 from graphnav.recording.formats.schema import GEOID
 from graphnav.recording.formats.writer import quote
 

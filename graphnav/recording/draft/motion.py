@@ -245,3 +245,13 @@ def _mask_gaps(grid: Array, t: Array) -> Array:
     """Grid times inside or adjacent to a gap of more than two seconds."""
     k = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
     return np.asarray(t[k] - t[k - 1] > 2.0)
+
+
+def find_odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> Lag | None:
+    """Delay of the wheel speed, by its accelerations against the forward ones of the IMU."""
+    if len(t) < 50:
+        return None
+    grid, forward = resample_on_grid(felt[0], felt[1][:, None])
+    even = np.arange(t[0], t[-1], GRID)
+    pull = np.gradient(compute_moving_mean(np.interp(even, t, speed)), GRID)
+    return find_lag(grid, filter_band(forward[:, 0]), even, filter_band(pull))

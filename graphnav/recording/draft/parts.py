@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.recording.draft.logs import Source
 from graphnav.recording.draft.plain import Plain
+from graphnav.recording.draft.tables import Source
 
 
 def join_parts(some: Sequence[Source]) -> Source | None:

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.recording.draft.logs import Source, read_header, read_sensor
+from graphnav.recording.draft.logs import read_header
 from graphnav.recording.draft.motion import is_course_in_radians
 from graphnav.recording.draft.plain import add_words
+from graphnav.recording.draft.tables import Source, read_sensor
 from graphnav.recording.formats.columns import ATTITUDE, FileColumns, match_attitude, split_unit
 
 # heights by the names of their columns; others are taken as above the ellipsoid

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +15,11 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import DAY, NEAR, UNIX, gps_to_utc
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.logs import CALLED, WANTED, NoSensorError, Source, has_gravity, read_log
+from graphnav.recording.draft.logs import CALLED, NoSensorError, has_gravity, read_log
 from graphnav.recording.draft.parts import join_parts
 from graphnav.recording.draft.raw import RawFiles, separate_raw, tell_kind
 from graphnav.recording.draft.references import separate_reference
+from graphnav.recording.draft.tables import WANTED, Source
 from graphnav.recording.formats import columns as matching
 from graphnav.recording.formats import list_formats
 from graphnav.recording.formats.schema import SPEED
@@ -55,30 +56,10 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     raw, files = separate_raw([file for path in paths for file in _list_logs(path)])
     if not files:
         raise RecordingError(f"{paths[0]}: observations of GNSS, and no IMU beside them", key="draft.no_imu")
-    every: dict[str, list[Source]] = {}
-    left: list[str] = []
-    nothing: dict[str, str] = {}  # reasons by the names of files
-    refused: dict[Path, str] = {}  # reasons why some are no tables
-    for path in files:
-        try:
-            found = read_log(path, topics)
-        except NoSensorError as error:
-            if len(files) == 1 and not raw.observed:
-                raise
-            nothing[path.name if path.exists() else str(error)] = str(error)
-            if isinstance(error.__cause__, RecordingError) or error.key == "draft.no_time":
-                refused[path] = str(error)
-            if path in paths and isinstance(error.__cause__, RecordingError) and error.key != "table.separator":
-                raise
-            continue
-        for sensor, source in found.items():
-            every.setdefault(sensor, []).append(source)
+    every, unread = _read_logs(paths, files, topics, alone=not raw.observed)
     others = _name_others(paths, [*files, *raw.observed, *(path for some in raw.placing.values() for path in some)])
-    if others:
-        left.append(f"{others}: no logs of a kind that is known")
-    if unknown := [name for name, why in nothing.items() if why not in refused.values()]:
-        left.append(f"left out: {', '.join(unknown)}: no sensor is recognised in the columns; names that are: {CALLED}")
-    left += [f"left out: {why}" for why in refused.values()]
+    left = [f"{others}: no logs of a kind that is known"] if others else []
+    left += unread.list_notes()
     every["gnss"], reference = separate_reference(every.get("gnss", []))
     sensors = {
         sensor: chosen for sensor, some in every.items() if (chosen := _choose_source(sensor, some, left)) is not None
@@ -86,30 +67,17 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     if reference is not None:
         sensors["truth"] = reference
     if "imu" not in sensors and "gyro" in sensors:
-        if "accel" not in sensors and "accel" in every and "gravity" in sensors:
-            sensors["accel"] = _add_gravity(every["accel"][0], sensors["gravity"], left)
-        if "accel" in sensors:
-            sensors["imu"] = _join_imu(sensors["gyro"], sensors["accel"])
-            if (pull := every.get("gravity")) and sensors["accel"] in every["accel"]:
-                left.append(f"left out: {pull[0].path.name}: {sensors['accel'].path.name} has gravity in it")
-        elif "accel" in every:
-            worst = every["accel"][0]
-            guesses.guess_accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.find_unit("ax", "accel"))
+        _make_imu(sensors, every, left)
     if "imu" not in sensors:
         there = ", ".join([*sensors, *(["raw GNSS"] if raw.observed else [])]) or "nothing"
-        unread = f" ({next(iter(refused.values()))})" if refused else ""
-        if others and not refused and not raw.observed:
-            unread = f" ({others})"
-        logs = [source.log for some in every.values() for source in some if source.log is not None]
-        if skipped := [note for log in logs for note in log.remarks if get_key(note) == "log.broken_lines"]:
-            unread = f" ({skipped[0]}; lines of an IMU belong in a table of their own, with a header)"
+        cause = _explain_no_imu(every, unread, "" if raw.observed else others)
         raise RecordingError(
-            f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}",
+            f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{cause}",
             key="draft.no_imu",
         )
     if not sensors.keys() & {"gnss", "odometer"} and not raw.observed:
-        named = {path: why for path, why in refused.items() if path in paths}
-        _check_unread(paths, {path: nothing[path.name] for path in files if path.name in nothing}, named)
+        named = {path: why for path, why in unread.refused.items() if path in paths}
+        _check_unread(paths, {path: unread.nothing[path.name] for path in files if path.name in unread.nothing}, named)
     _date_times_of_day(sensors)
     _tell_gps_from_unix(sensors)
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
@@ -123,6 +91,78 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         left,
         raw,
     )
+
+
+@dataclass(frozen=True)
+class _Unread:
+    """Files without a known sensor, with the reasons."""
+
+    nothing: dict[str, str] = field(default_factory=dict)  # by the names of files
+    refused: dict[Path, str] = field(default_factory=dict)  # those of them that are no tables
+
+    def list_notes(self) -> list[str]:
+        """A sentence for those that are tables, and for each that is none."""
+        unknown = ", ".join(name for name, why in self.nothing.items() if why not in self.refused.values())
+        tables = f"left out: {unknown}: no sensor is recognised in the columns; names that are: {CALLED}"
+        return [*([tables] if unknown else []), *(f"left out: {why}" for why in self.refused.values())]
+
+
+def _read_logs(
+    paths: Sequence[Path], files: Sequence[Path], topics: Sequence[str], alone: bool
+) -> tuple[dict[str, list[Source]], _Unread]:
+    """The logs of each sensor, and the files that hold none.
+
+    Raises
+    ------
+    RecordingError
+        If the only file holds none, where nothing else was found (`alone`), or one of `paths` cannot be read.
+    """
+    every: dict[str, list[Source]] = {}
+    unread = _Unread()
+    for path in files:
+        try:
+            found = read_log(path, topics)
+        except NoSensorError as error:
+            if len(files) == 1 and alone:
+                raise
+            unread.nothing[path.name if path.exists() else str(error)] = str(error)
+            if isinstance(error.__cause__, RecordingError) or error.key == "draft.no_time":
+                unread.refused[path] = str(error)
+            if path in paths and isinstance(error.__cause__, RecordingError) and error.key != "table.separator":
+                raise
+            continue
+        for sensor, source in found.items():
+            every.setdefault(sensor, []).append(source)
+    return every, unread
+
+
+def _make_imu(sensors: dict[str, Source], every: Mapping[str, list[Source]], left: list[str]) -> None:
+    """Add the IMU of a gyro's log and an accelerometer's, with a log of gravity if its own forces are without.
+
+    Raises
+    ------
+    RecordingError
+        If no forces are those of an accelerometer.
+    """
+    if "accel" not in sensors and "accel" in every and "gravity" in sensors:
+        sensors["accel"] = _add_gravity(every["accel"][0], sensors["gravity"], left)
+    if "accel" in sensors:
+        sensors["imu"] = _join_imu(sensors["gyro"], sensors["accel"])
+        if (pull := every.get("gravity")) and sensors["accel"] in every["accel"]:
+            left.append(f"left out: {pull[0].path.name}: {sensors['accel'].path.name} has gravity in it")
+    elif "accel" in every:
+        worst = every["accel"][0]
+        guesses.guess_accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.find_unit("ax", "accel"))
+
+
+def _explain_no_imu(every: Mapping[str, list[Source]], unread: _Unread, others: str) -> str:
+    """The likely cause of a missing IMU, in brackets: lines or files that were not read; '' where there is none."""
+    logs = [source.log for some in every.values() for source in some if source.log is not None]
+    if skipped := [note for log in logs for note in log.remarks if get_key(note) == "log.broken_lines"]:
+        return f" ({skipped[0]}; lines of an IMU belong in a table of their own, with a header)"
+    if unread.refused:
+        return f" ({next(iter(unread.refused.values()))})"
+    return f" ({others})" if others else ""
 
 
 def _date_times_of_day(sensors: dict[str, Source]) -> None:

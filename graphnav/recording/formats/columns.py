@@ -131,7 +131,7 @@ class FileColumns:
 
     @property
     def sensor(self) -> str | None:
-        """The sensor of the file, as `graphnav.recording.draft.logs` names them, or None; gravity is a phone's own."""
+        """The sensor of the file as `graphnav.recording.draft.tables` names them, or None; gravity is a phone's own."""
         gyro, accel = ({f"{s}{x}" for x in "xyz"} <= self.names.keys() for s in "ga")
         if "t" not in self.names:
             return None

@@ -12,6 +12,7 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Truth
 from graphnav.recording.formats import schema
+from graphnav.recording.formats.courses import blank_unknown, compute_horizontal_velocity
 from graphnav.recording.formats.increments import compute_periods, note_gaps
 from graphnav.recording.formats.places import convert_geodetic
 from graphnav.recording.formats.pulses import count_pulses
@@ -20,10 +21,8 @@ from graphnav.recording.formats.repair import (
     DEFAULT_SD_V,
     VAGUEST,
     VAGUEST_V,
-    blank_unknown,
     check_residuals,
     choose_sigmas,
-    compute_horizontal_velocity,
     parse_fix_types,
 )
 from graphnav.recording.formats.table import Table
@@ -99,44 +98,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Notes) -> Gnss:
             f"{format_count(vague.sum(), 'fix', 'fixes')} with a sigma of more than {VAGUEST:g} m left out",
         )
         llh, sd, rows = llh[~vague], sd[~vague], rows.take(~vague)
-    v = sd_v = None
-    if "vd" in rows and "vu" not in rows:
-        rows = rows.with_column("vu", -rows["vd"])
-    there = [c for c in ("ve", "vn", "vu") if c in rows]
-    scale = schema.SPEED[d.units.speed]
-    for name in _SD_V:  # the file's sigmas have the file's unit, those of the .toml m/s
-        rows = rows.with_column(name, rows[name] * scale) if name in rows else rows
-    if len(there) == 3:
-        v = rows.stack("ve", "vn", "vu") * scale
-        absent = np.isnan(v).any(-1)
-        beyond = ~absent & (np.linalg.norm(v, axis=1) > FASTEST)
-        if 0 < beyond.sum() < 0.5 * len(v):  # else in another unit
-            remarks.add(
-                "gnss.velocity_beyond",
-                f"{format_count(beyond.sum(), 'GNSS velocity', 'GNSS velocities')} of more than {FASTEST:g} m/s, "
-                f"which no land vehicle reaches, left out (first at t = {rows['t'][beyond][0]:.3f} s)",
-            )
-            absent |= beyond
-        v[absent] = np.nan
-        sd_v = choose_sigmas(rows, _SD_V, d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
-        absent |= (sd_v > VAGUEST_V).any(-1)
-        v[absent] = sd_v[absent] = np.nan
-        if absent.all():
-            v = sd_v = None
-            remarks.add("gnss.velocity_blank", "the GNSS velocity columns are blank throughout: no velocities")
-    elif "speed" in rows and "course" in rows:
-        course = rows["course"] * ANGLE[d.units.angle or "deg"]
-        stated = np.array(d.sd_v or DEFAULT_SD_V)
-        if any(name in rows for name in _SD_V):
-            known = np.isfinite(rows["speed"])
-            stated = choose_sigmas(rows, _SD_V, d.sd_v, DEFAULT_SD_V, "GNSS velocity", known, remarks)
-        v, sd_v, sentence = compute_horizontal_velocity(rows["speed"] * scale, course, stated)
-        remarks.add("gnss.velocity_of_course", sentence)
-    elif there:
-        remarks.add(
-            "gnss.velocity_partly",
-            f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used",
-        )
+    v, sd_v = _build_velocities(d, rows, remarks)
     kinds = parse_fix_types(rows, d.units.type) if "type" in rows else None
     gnss = Gnss(
         rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib",
@@ -145,6 +107,54 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Notes) -> Gnss:
     if (count := next((name for name in ("satellites", "nsat") if name in rows), None)) is not None:
         gnss = replace(gnss, satellites=rows[count])
     return replace(gnss, residual_rms=check_residuals(rows)) if "resid_rms_m" in rows else gnss
+
+
+def _build_velocities(d: schema.GnssTable, rows: Table, remarks: Notes) -> tuple[Array | None, Array | None]:
+    """Velocities (N, 3) m/s, of three axes or of speed and course, and their 1-sigmas; None where there are none."""
+    scale = schema.SPEED[d.units.speed]
+    for name in _SD_V:  # the file's sigmas have the file's unit, those of the .toml m/s
+        rows = rows.with_column(name, rows[name] * scale) if name in rows else rows
+    if "vd" in rows and "vu" not in rows:
+        rows = rows.with_column("vu", -rows["vd"])
+    there = [c for c in ("ve", "vn", "vu") if c in rows]
+    if len(there) == 3:
+        return _take_velocities(d, rows, rows.stack("ve", "vn", "vu") * scale, remarks)
+    if "speed" in rows and "course" in rows:
+        course = rows["course"] * ANGLE[d.units.angle or "deg"]
+        stated = np.array(d.sd_v or DEFAULT_SD_V)
+        if any(name in rows for name in _SD_V):
+            known = np.isfinite(rows["speed"])
+            stated = choose_sigmas(rows, _SD_V, d.sd_v, DEFAULT_SD_V, "GNSS velocity", known, remarks)
+        v, sd_v, sentence = compute_horizontal_velocity(rows["speed"] * scale, course, stated)
+        remarks.add("gnss.velocity_of_course", sentence)
+        return v, sd_v
+    if there:
+        remarks.add(
+            "gnss.velocity_partly",
+            f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used",
+        )
+    return None, None
+
+
+def _take_velocities(d: schema.GnssTable, rows: Table, v: Array, remarks: Notes) -> tuple[Array | None, Array | None]:
+    """The velocities (N, 3) m/s of a file, and their 1-sigmas, without impossible and vague ones; None without any."""
+    absent = np.isnan(v).any(-1)
+    beyond = ~absent & (np.linalg.norm(v, axis=1) > FASTEST)
+    if 0 < beyond.sum() < 0.5 * len(v):  # else in another unit
+        remarks.add(
+            "gnss.velocity_beyond",
+            f"{format_count(beyond.sum(), 'GNSS velocity', 'GNSS velocities')} of more than {FASTEST:g} m/s, "
+            f"which no land vehicle reaches, left out (first at t = {rows['t'][beyond][0]:.3f} s)",
+        )
+        absent |= beyond
+    v[absent] = np.nan
+    sd_v = choose_sigmas(rows, _SD_V, d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
+    absent |= (sd_v > VAGUEST_V).any(-1)
+    v[absent] = sd_v[absent] = np.nan
+    if absent.all():
+        remarks.add("gnss.velocity_blank", "the GNSS velocity columns are blank throughout: no velocities")
+        return None, None
+    return v, sd_v
 
 
 def _fill(values: Array, rows: Table) -> Array:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,6 +32,10 @@ from graphnav.recording.formats.table import Table, read_table
 from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.sensors import list_sensors
 
+if TYPE_CHECKING:
+    from graphnav.gnss.series import Observations
+    from graphnav.gnss.single_point import SinglePoint
+
 _SETTLED = {  # assumptions of a log's reader, and the keys that replace them
     "axes_assumed": {"axes", "forward", "up"},
     "lever_arm_unknown": {"lever_arm"},
@@ -55,88 +59,24 @@ def read_folder(source: str | Path, allow_outside: bool = False) -> Recording:
     path = Path(source)
     path = path / "recording.toml" if path.is_dir() else path
     d = schema.read_description(path)
-    remarks = Notes()
-    files = [path]
-    logs: dict[str, Log | None] = {}  # by file; one log may contain several sensors
-    zeros: list[float] = []  # zeros of their clocks
-    topics: dict[str, tuple[str, ...]] = {}  # topics of each file
-    known = list_sensors()
-    settled: set[str] = set()  # assumptions of logs that the .toml replaces
-    for name in ("imu", "gnss", "odometer", *known):
-        section = getattr(d, name)
-        if section is not None:
-            topics[section.file] = (*topics.get(section.file, ()), *section.topic)
-            settled |= {f"{name}.{figure}" for figure, keys in _SETTLED.items() if keys & section.model_fields_set}
-
-    def parse_table(name: str) -> Table:
-        section = getattr(d, name)
-        file = resolve_beside(path, section.file, f"{name}.file", allow_outside)
-        files.append(file)
-        required, optional, keep = section.required, section.optional, section.keep
-        if name == "truth":
-            position = ("x", "y") if section.frame == "local" else ("lat", "lon", "h")
-            required, optional = (*required, *position), tuple(c for c in optional if c not in position)
-        rows = read_table(file, required, optional, section.columns, keep.column if keep else None)
-        if name == "odometer":  # the columns needed depend on those present
-            required = (*required, *section.list_readings(tuple(rows.columns)))
-            if not all(column in rows for column in required):
-                read_table(file, required, (), section.columns)  # raises an error that says what is missing
-        if name in known:
-            required = (*required, *list_needed(known[name], rows))
-        return select_usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
-
-    def read_one(name: str, of_table: Callable[[Any, Table, Notes], Any], of_log: Callable[[Any, Any], Any]) -> Any:
-        """The sensor of a table of the .toml: from its CSV file, or from the log of another program."""
-        section = getattr(d, name)
-        if section is None:
-            return None
-        if section.file not in logs:
-            file = resolve_beside(path, section.file, f"{name}.file", allow_outside)
-            logs[section.file] = read_other_log(file, topics.get(section.file, ()), allow_outside)
-        log = logs[section.file]
-        if section.topic and not (log and log.topics):
-            raise RecordingError(
-                f"{path}: '{name}.topic' is only for ROS bags, and {section.file} is none", key="key.not_here"
-            )
-        if log is None:
-            return of_table(section, parse_table(name), remarks)
-        files.extend(file for file in log.files if file not in files)
-        held = log.sensors.get(name) if name in known else getattr(log, name)
-        if held is None:
-            raise RecordingError(f"{path}: '{name}.file': {section.file} holds no {name}", key="log.no_sensor")
-        for key in ("columns", "units", "keep"):
-            if key in section.model_fields_set:
-                raise RecordingError(
-                    f"{path}: '{name}.{key}' is only for CSV files, and {section.file} is none", key="key.not_here"
-                )
-        remarks.extend(r for r in log.remarks if r not in remarks and get_key(r) not in settled)
-        if log.gps_zero is not None:
-            zeros.append(log.gps_zero - section.time_offset)
-        return of_log(section, held)
-
-    imu = read_one("imu", build_imu, _complete_imu)
-    gnss = read_one("gnss", build_gnss, _complete_gnss)
-    odometer = read_one("odometer", build_odometer, _complete_odometer)
+    reader = _Reader(path, d, allow_outside)
+    imu = reader.read_sensor("imu", build_imu, _complete_imu)
+    gnss = reader.read_sensor("gnss", build_gnss, _complete_gnss)
+    odometer = reader.read_sensor("odometer", build_odometer, _complete_odometer)
     sensors = {
-        name: read_one(name, partial(build_series, one), lambda _, held: held)
-        for name, one in known.items()
-        if getattr(d, name) is not None
+        name: reader.read_sensor(name, partial(build_series, one), lambda _, held: held)
+        for name, one in reader.known.items()
+        if name in reader.sections
     }
-    gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else next(iter(zeros), None)
+    gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else next(iter(reader.zeros), None)
     raw = None
     if d.raw_gnss is not None:
-        raw, fixes = _load_raw(d.raw_gnss, path, gps_zero, allow_outside, remarks, files)
+        raw, fixes = _load_raw(reader, d.raw_gnss, gps_zero)
         if gnss is None:
             gnss = fixes
-            remarks.add("gnss.of_raw", f"no [gnss]: {len(fixes.t)} single-point fixes of the raw observations are used")
-    truth = None
-    if d.truth and d.truth.closed_loop_sigma:
-        truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
-    elif d.truth and d.truth.file and Path(d.truth.file).suffix in (".nav", ".pos", ".tum"):
-        files.append(resolve_beside(path, d.truth.file, "truth.file", allow_outside))
-        truth = _read_truth(d.truth, files[-1], remarks)
-    elif d.truth:
-        truth = build_truth(d.truth, parse_table("truth"), remarks)
+            words = f"no [gnss]: {len(fixes.t)} single-point fixes of the raw observations are used"
+            reader.remarks.add("gnss.of_raw", words)
+    truth = None if d.truth is None else _read_truth(reader, d.truth, imu)
     name = d.name or (path.resolve().parent.name if path.name == "recording.toml" else path.stem)
     return Recording(
         name,
@@ -146,68 +86,167 @@ def read_folder(source: str | Path, allow_outside: bool = False) -> Recording:
         odometer,
         truth,
         path,
-        tuple(files),
+        tuple(reader.files),
         gps_zero,
-        tuple(remarks),
+        tuple(reader.remarks),
         raw_gnss=raw,
         sensors=sensors,
     )
 
 
-def _load_raw(
-    d: schema.RawGnssTable, path: Path, zero: float | None, allow_outside: bool, remarks: Notes, files: list[Path]
-) -> tuple[RawGnss, Gnss]:
+class _Reader:
+    """Reads what the tables of a recording.toml name, and keeps what concerns the whole recording."""
+
+    def __init__(self, path: Path, d: schema.RecordingFile, allow_outside: bool) -> None:
+        self.path, self.d, self.allow_outside = path, d, allow_outside
+        self.known = list_sensors()
+        self.sections: dict[str, Any] = {
+            name: section
+            for name in ("imu", "gnss", "odometer", *self.known)
+            if (section := getattr(d, name)) is not None
+        }
+        self.remarks = Notes()
+        self.files = [path]
+        self.zeros: list[float] = []  # s since the GPS epoch, at which the clocks of logs begin
+        self._logs: dict[str, Log | None] = {}  # by file; one log may contain several sensors
+        self._settled = {  # assumptions of logs that the .toml replaces
+            f"{name}.{figure}"
+            for name, section in self.sections.items()
+            for figure, keys in _SETTLED.items()
+            if keys & section.model_fields_set
+        }
+
+    def resolve(self, file: str, key: str) -> Path:
+        """The path of a file that a key names."""
+        return resolve_beside(self.path, file, key, self.allow_outside)
+
+    def read_sensor(
+        self, name: str, of_table: Callable[[Any, Table, Notes], Any], of_log: Callable[[Any, Any], Any]
+    ) -> Any:
+        """The sensor of a table of the .toml, from its CSV file or from the log of another program; None without it."""
+        section = self.sections.get(name)
+        if section is None:
+            return None
+        log = self._read_log(name, section.file)
+        if section.topic and not (log and log.topics):
+            raise RecordingError(
+                f"{self.path}: '{name}.topic' is only for ROS bags, and {section.file} is none", key="key.not_here"
+            )
+        if log is None:
+            return of_table(section, self.read_rows(name), self.remarks)
+        held = log.sensors.get(name) if name in self.known else getattr(log, name)
+        if held is None:
+            raise RecordingError(f"{self.path}: '{name}.file': {section.file} holds no {name}", key="log.no_sensor")
+        for key in ("columns", "units", "keep"):
+            if key in section.model_fields_set:
+                raise RecordingError(
+                    f"{self.path}: '{name}.{key}' is only for CSV files, and {section.file} is none", key="key.not_here"
+                )
+        self.remarks.extend(r for r in log.remarks if r not in self.remarks and get_key(r) not in self._settled)
+        if log.gps_zero is not None:
+            self.zeros.append(log.gps_zero - section.time_offset)
+        return of_log(section, held)
+
+    def read_rows(self, name: str) -> Table:
+        """The usable rows of the CSV file of a table."""
+        section = getattr(self.d, name)
+        file = self.resolve(section.file, f"{name}.file")
+        self.files.append(file)
+        required, optional, keep = section.required, section.optional, section.keep
+        if name == "truth":
+            position = ("x", "y") if section.frame == "local" else ("lat", "lon", "h")
+            required, optional = (*required, *position), tuple(c for c in optional if c not in position)
+        rows = read_table(file, required, optional, section.columns, keep.column if keep else None)
+        if name == "odometer":  # the columns needed depend on those present
+            required = (*required, *section.list_readings(tuple(rows.columns)))
+            if not all(column in rows for column in required):
+                read_table(file, required, (), section.columns)  # raises an error that says what is missing
+        if name in self.known:
+            required = (*required, *list_needed(self.known[name], rows))
+        return select_usable_rows(rows, name, required, keep, section.units.t, section.time_offset, self.remarks)
+
+    def _read_log(self, name: str, file: str) -> Log | None:
+        """The log of another program that a table names, read once; None for a CSV file."""
+        if file not in self._logs:
+            topics = (topic for one in self.sections.values() if one.file == file for topic in one.topic)
+            path = self.resolve(file, f"{name}.file")
+            self._logs[file] = read_other_log(path, tuple(topics), self.allow_outside)
+        log = self._logs[file]
+        if log is not None:
+            self.files.extend(one for one in log.files if one not in self.files)
+        return log
+
+
+def _load_raw(reader: _Reader, d: schema.RawGnssTable, zero: float | None) -> tuple[RawGnss, Gnss]:
     """The raw observations of [raw_gnss], and single-point fixes computed from them."""
     if zero is None:
         raise RecordingError(
-            f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: set clock = \"gps week 2130\" or a UTC date",
+            f"{reader.path}: 'clock': [raw_gnss] needs to know what t = 0 is: "
+            'set clock = "gps week 2130" or a UTC date',
             key="clock.unknown",
         )
-    from graphnav.gnss import columns
     from graphnav.gnss.load import Sources, load_raw
     from graphnav.gnss.placing import Corrected
 
     some = {
-        name: tuple(resolve_beside(path, file, f"raw_gnss.{name}", allow_outside) for file in getattr(d, name) or ())
-        for name in _RAW_FILES
+        name: tuple(reader.resolve(file, f"raw_gnss.{name}") for file in getattr(d, name) or ()) for name in _RAW_FILES
     }
     corrected = Corrected(clock="clock" in d.corrected, troposphere="troposphere" in d.corrected)
     sources = Sources(
         **some, base_position=d.base_position, corrected=corrected, nominal_stamps=d.stamps == "nominal",
         lever_arm=d.lever_arm,
     )  # fmt: skip
-    files.extend(sources.files)
-    given = None
-    if sources.rover[0].name.endswith((".csv", ".csv.gz")):
-        if len(sources.rover) > 1:
-            raise RecordingError(f"{path}: 'raw_gnss.rover': one CSV file, not {len(sources.rover)}", key="key.value")
-        rows = read_table(sources.rover[0], columns.REQUIRED, columns.OPTIONAL, d.columns)
-        given = columns.make_observations(rows.columns, zero, sources.rover[0].name)
-    elif d.columns:
-        raise RecordingError(
-            f"{path}: 'raw_gnss.columns' is only for a CSV file, and {d.rover[0]} is none", key="key.not_here"
-        )
-    raw, found, notes = load_raw(sources, zero - d.time_offset, given)
-    remarks.extend(notes)
+    reader.files.extend(sources.files)
+    raw, found, notes = load_raw(sources, zero - d.time_offset, _read_observations(reader, d, sources.rover, zero))
+    reader.remarks.extend(notes)
+    return raw, _make_fixes(found, d.lever_arm)
+
+
+def _read_observations(
+    reader: _Reader, d: schema.RawGnssTable, rover: Sequence[Path], zero: float
+) -> Observations | None:
+    """The rover's observations if its file is CSV, else None."""
+    from graphnav.gnss import columns
+
+    if not rover[0].name.endswith((".csv", ".csv.gz")):
+        if d.columns:
+            raise RecordingError(
+                f"{reader.path}: 'raw_gnss.columns' is only for a CSV file, and {d.rover[0]} is none",
+                key="key.not_here",
+            )
+        return None
+    if len(rover) > 1:
+        raise RecordingError(f"{reader.path}: 'raw_gnss.rover': one CSV file, not {len(rover)}", key="key.value")
+    rows = read_table(rover[0], columns.REQUIRED, columns.OPTIONAL, d.columns)
+    return columns.make_observations(rows.columns, zero, rover[0].name)
+
+
+def _make_fixes(found: SinglePoint, lever_arm: Sequence[float]) -> Gnss:
+    """Fixes of the single-point solutions there are."""
     good = np.isfinite(found.p[:, 0])
     sd = np.sqrt(np.diagonal(found.covariance[good], axis1=1, axis2=2))
     v = np.einsum("nij,nj->ni", enu_axes(ecef_to_llh(found.p[good])), found.v[good])
     sd_v = np.sqrt(np.diagonal(found.covariance_v[good], axis1=1, axis2=2))
     known = np.isfinite(v).any()
-    fixes = Gnss(
+    return Gnss(
         found.t[good], ecef_to_llh(found.p[good]), sd, v if known else None, sd_v if known else None,
-        np.array(d.lever_arm), derived=True,
+        np.array(lever_arm), derived=True,
     )  # fmt: skip
-    return raw, fixes
 
 
-def _read_truth(d: schema.TruthTable, file: Path, remarks: Notes) -> Truth:
-    """Read the truth from a trajectory file of another program."""
+def _read_truth(reader: _Reader, d: schema.TruthTable, imu: Imu) -> Truth:
+    """The truth of a CSV file, of a trajectory file of another program, or that a loop closes."""
+    if d.closed_loop_sigma:
+        return Truth(imu.t[[0, -1]], of=d.of, closed_loop_sigma=d.closed_loop_sigma)
+    if d.file is None or Path(d.file).suffix not in (".nav", ".pos", ".tum"):
+        return build_truth(d, reader.read_rows("truth"), reader.remarks)
+    file = reader.resolve(d.file, "truth.file")
+    reader.files.append(file)
     for key in ("columns", "units", "keep"):
         if key in d.model_fields_set:
             raise RecordingError(f"{file}: 'truth.{key}' is only for CSV files", key="key.not_here")
     track = read_trajectory(file)
-    remarks.extend(track.notes)
+    reader.remarks.extend(track.notes)
     local = track.frame == "local"
     llh, xyz = (None, track.llh) if local else (track.llh, None)
     return Truth(track.t + d.time_offset, llh, xyz, track.v, track.rph, d.of)

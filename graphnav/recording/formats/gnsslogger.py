@@ -20,8 +20,9 @@ from graphnav.core.notes import Notes, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import UNIX, date_week_times, unix_to_gps
 from graphnav.recording import Gnss, Imu
+from graphnav.recording.formats.courses import compute_horizontal_velocity
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, LATEST, compute_horizontal_velocity
+from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, LATEST
 
 _BEGIN = re.compile(
     rb"^(?:#\s*)?(?:Raw,(?:utcTime|Elapsed)|Fix,(?:Provider|GPS|gps|FLP),|(?:Uncal)?(?:Gyro|Accel),\w)", re.M

@@ -23,8 +23,9 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import count_leap_seconds, date_week_times, utc_to_gps
 from graphnav.recording import Gnss, convert_fix_types
 from graphnav.recording.formats import novatel, ubx
+from graphnav.recording.formats.courses import compute_horizontal_velocity
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, compute_horizontal_velocity
+from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES
 
 KNOTS = 1852 / 3600  # m/s
 KMH = 1 / 3.6

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,26 @@ DEFAULT_SD_V = (0.2, 0.2, 0.4)  # m/s
 NMEA_TYPES = {0: 0, 1: 5, 2: 4, 3: 0, 4: 1, 5: 2, 9: 3}
 
 
+@dataclass(frozen=True)
+class _Sensor:
+    """Whose rows are selected, and where it is remarked on."""
+
+    name: str
+    unit: str  # of its stamps in the file
+    offset: float  # s, to be added to them
+    remarks: Notes
+
+    @property
+    def label(self) -> str:
+        """Its name in sentences."""
+        return _SENSOR_LABELS.get(self.name, self.name)
+
+    @property
+    def scale(self) -> float:
+        """s in a unit of its stamps."""
+        return TIME_UNITS[self.unit]
+
+
 def select_usable_rows(
     rows: Table, sensor: str, needed: tuple[str, ...], keep: Keep | None, unit: str, offset: float, remarks: Notes
 ) -> Table:
@@ -56,35 +77,64 @@ def select_usable_rows(
         For infinite values but in an odometer's log, if too few rows are left, if the time steps cannot be seconds, or
         if the stamps run over the same times twice.
     """
-    label = _SENSOR_LABELS.get(sensor, sensor)
+    of, stamps = _Sensor(sensor, unit, offset, remarks), rows["t"]
     if rows.cut:
         remarks.add(f"{sensor}.cut", f"{rows.path.name} ends within a line, as after a loss of power: it is left out")
-    with np.errstate(over="ignore"):
-        t = rows["t"] * TIME_UNITS[unit] + offset
-    # a stamp of thousands of years is invalid, like an infinite one
-    stamps = rows["t"]
-    rows = rows.with_column("t", np.where(np.abs(t) > LATEST, np.inf, rows["t"]))
-    for name in rows.columns:
-        bad = np.flatnonzero(np.isinf(rows[name]))
-        if len(bad) and sensor == "odometer":  # of which single readings can be missing
-            rows = rows.with_column(name, np.where(np.isinf(rows[name]), np.nan, rows[name]))
-        elif len(bad):
-            what = (
-                f"{stamps[bad[0]]:.16g} is no time in {unit}"
-                if name == "t"
-                else "the value is infinite; leave it blank"
-            )
-            dates = [other for other, scale in TIME_UNITS.items() if UNIX < stamps[bad[0]] * scale < 3.0 * UNIX]
-            hint = f'; say units = {{ t = "{dates[0]}" }}: it is then a date' if name == "t" and dates else ""
-            raise RecordingError(f"{rows.describe_place(bad[0], name)}: {what}{hint}", key="table.not_finite")
+    rows = _refuse_infinite(rows, of)
     if keep is not None:
-        rows = rows.take(rows[Table.KEEP] >= keep.at_least)
-        if not len(rows):
-            raise RecordingError(
-                f"{rows.path}: no row has {keep.column} of at least {keep.at_least:g} (keep)", key="table.keep"
-            )
-    rows = rows.with_column("t", rows["t"] * TIME_UNITS[unit] + offset)
+        rows = _take_kept(rows, keep)
+    rows = rows.with_column("t", rows["t"] * of.scale + offset)
+    rows = _drop_blank(rows, needed, of)
+    check_days(rows, unit)
+    rows = _move_lone_stamps(rows, of)
+    rows = _continue_clock(rows, of)
+    if "lat" in rows and "lon" in rows:
+        check_fix_clock(rows, of.label)
+    rows = _sort_by_time(rows, of)
+    if sensor == "imu":
+        rows = _spread_packets(rows, stamps, of)
+    rows = _drop_repeated(rows, stamps, of)
+    if sensor == "imu":
+        check_imu_steps(rows, unit)
+    return _drop_held(rows, of) if sensor == "gnss" else rows
 
+
+def _refuse_infinite(rows: Table, of: _Sensor) -> Table:
+    """The rows, with infinite values blank in an odometer's log, of which single readings can be missing.
+
+    A stamp of thousands of years is invalid, like an infinite one.
+    """
+    stamps = rows["t"]
+    with np.errstate(over="ignore"):
+        late = np.abs(stamps * of.scale + of.offset) > LATEST
+    rows = rows.with_column("t", np.where(late, np.inf, stamps))
+    for name in rows.columns:
+        infinite = np.isinf(rows[name])
+        if not infinite.any():
+            continue
+        if of.name == "odometer":
+            rows = rows.with_column(name, np.where(infinite, np.nan, rows[name]))
+            continue
+        first = np.flatnonzero(infinite)[0]
+        what, hint = "the value is infinite; leave it blank", ""
+        if name == "t":
+            what = f"{stamps[first]:.16g} is no time in {of.unit}"
+            dates = [unit for unit, scale in TIME_UNITS.items() if UNIX < stamps[first] * scale < 3.0 * UNIX]
+            hint = f'; say units = {{ t = "{dates[0]}" }}: it is then a date' if dates else ""
+        raise RecordingError(f"{rows.describe_place(first, name)}: {what}{hint}", key="table.not_finite")
+    return rows
+
+
+def _take_kept(rows: Table, keep: Keep) -> Table:
+    rows = rows.take(rows[Table.KEEP] >= keep.at_least)
+    if not len(rows):
+        raise RecordingError(
+            f"{rows.path}: no row has {keep.column} of at least {keep.at_least:g} (keep)", key="table.keep"
+        )
+    return rows
+
+
+def _drop_blank(rows: Table, needed: tuple[str, ...], of: _Sensor) -> Table:
     blank = np.zeros(len(rows), dtype=bool)
     for name in needed:
         blank |= np.isnan(rows[name])
@@ -92,64 +142,89 @@ def select_usable_rows(
         raise RecordingError(
             f"{rows.path}: no row holds all of {', '.join(needed)} (all blank or NaN)", key="table.all_blank"
         )
-    if blank.any():
-        first = np.flatnonzero(blank)[0]
-        at = f" (first at t = {rows['t'][first]:.3f} s)" if np.isfinite(rows["t"][first]) else ""
-        what = "blank, NaN or infinite" if sensor == "odometer" else "blank or NaN"
-        remarks.add(f"{sensor}.rows_blank", f"{format_row_count(blank, label)} with {what} values dropped{at}")
-        rows = rows.take(~blank)
+    if not blank.any():
+        return rows
+    first = rows["t"][np.flatnonzero(blank)[0]]
+    at = f" (first at t = {first:.3f} s)" if np.isfinite(first) else ""
+    what = "blank, NaN or infinite" if of.name == "odometer" else "blank or NaN"
+    of.remarks.add(f"{of.name}.rows_blank", f"{format_row_count(blank, of.label)} with {what} values dropped{at}")
+    return rows.take(~blank)
 
-    check_days(rows, unit)
-    if (lone := find_lone_stamps(rows["t"])).any():
-        k = int(np.flatnonzero(lone)[0])
-        remarks.add(
-            f"{sensor}.stamps_lone",
-            f"{format_row_count(lone, label)} with a stamp far from those around it (first {rows['t'][k]:.10g} s, "
-            f"after t = {rows['t'][k - 1]:.3f} s) taken to be halfway between them",
-        )
-        rows = rows.with_column("t", np.where(lone, take_halfway(rows["t"]), rows["t"]))
-    scale = TIME_UNITS[unit]
-    if (later := find_restarts((rows["t"] - offset) / scale, scale)) is not None:
-        remarks.add(
-            f"{sensor}.clock_again",
-            f"the clock of the {label} restarts at 0: {later.max() * scale:g} s are added after it",
-        )
-        rows = rows.with_column("t", rows["t"] + later * scale)
+
+def _move_lone_stamps(rows: Table, of: _Sensor) -> Table:
+    """Stamps far from those around them are put halfway between these."""
     t = rows["t"]
-    if "lat" in rows and "lon" in rows:
-        check_fix_clock(rows, label)
-    step = np.diff(t)
-    if (step < 0).any():
-        first = np.flatnonzero(step < 0)[0]
-        check_passes(rows, label)
-        remarks.add(
-            f"{sensor}.rows_unordered",
-            f"{label} rows out of order sorted by time ({format_count((step < 0).sum(), 'step')} back, "
-            f"the first after t = {t[first]:.3f} s)",
-        )
-        rows = rows.take(np.argsort(t, kind="stable"))
-        t = rows["t"]
-    if sensor == "imu" and (spread := spread_packets(t, find_repeats(rows.columns))) is not None:
-        remarks.add(
-            "imu.packets",
-            f"{describe_packets(spread[1])}{tell_rounding(stamps, np.r_[False, step == 0.0])}",
-        )
-        t = spread[0]
-        rows = rows.with_column("t", t)
+    lone = find_lone_stamps(t)
+    if not lone.any():
+        return rows
+    k = int(np.flatnonzero(lone)[0])
+    of.remarks.add(
+        f"{of.name}.stamps_lone",
+        f"{format_row_count(lone, of.label)} with a stamp far from those around it (first {t[k]:.10g} s, "
+        f"after t = {t[k - 1]:.3f} s) taken to be halfway between them",
+    )
+    return rows.with_column("t", np.where(lone, take_halfway(t), t))
+
+
+def _continue_clock(rows: Table, of: _Sensor) -> Table:
+    """A clock that restarts at 0, as at midnight, goes on."""
+    later = find_restarts((rows["t"] - of.offset) / of.scale, of.scale)
+    if later is None:
+        return rows
+    of.remarks.add(
+        f"{of.name}.clock_again",
+        f"the clock of the {of.label} restarts at 0: {later.max() * of.scale:g} s are added after it",
+    )
+    return rows.with_column("t", rows["t"] + later * of.scale)
+
+
+def _sort_by_time(rows: Table, of: _Sensor) -> Table:
+    t = rows["t"]
+    back = np.diff(t) < 0
+    if not back.any():
+        return rows
+    check_passes(rows, of.label)
+    of.remarks.add(
+        f"{of.name}.rows_unordered",
+        f"{of.label} rows out of order sorted by time ({format_count(back.sum(), 'step')} back, "
+        f"the first after t = {t[np.flatnonzero(back)[0]]:.3f} s)",
+    )
+    return rows.take(np.argsort(t, kind="stable"))
+
+
+def _spread_packets(rows: Table, stamps: Array, of: _Sensor) -> Table:
+    """Rows of an IMU that were stamped in packets at the times of their own; `stamps` are the file's."""
+    t = rows["t"]
+    spread = spread_packets(t, find_repeats(rows.columns))
+    if spread is None:
+        return rows
+    rounded = tell_rounding(stamps, np.r_[False, np.diff(t) == 0.0])
+    of.remarks.add("imu.packets", f"{describe_packets(spread[1])}{rounded}")
+    return rows.with_column("t", spread[0])
+
+
+def _drop_repeated(rows: Table, stamps: Array, of: _Sensor) -> Table:
+    """One row of each time; `stamps` are the file's."""
+    t = rows["t"]
     repeated = find_repeated(f"{rows.path}, column '{rows.file_names['t']}'", t)
-    if repeated.any():
-        remarks.add(
-            f"{sensor}.rows_repeated",
-            f"{format_row_count(repeated, label)} with the time of the row before dropped "
-            f"(first at t = {t[repeated][0]:.3f} s){tell_rounding(stamps, repeated)}",
-        )
-        rows = rows.take(~repeated)
-    if sensor == "imu":
-        check_imu_steps(rows, unit)
-    if sensor == "gnss" and not (new := mask_new_fixes(rows.columns)).all():
-        rows = rows.take(new)
-        held = format_row_count(~new, "GNSS")
-        remarks.add("gnss.held", f"{held} with the fix of the row before left out, {len(rows)} kept")
+    if not repeated.any():
+        return rows
+    of.remarks.add(
+        f"{of.name}.rows_repeated",
+        f"{format_row_count(repeated, of.label)} with the time of the row before dropped "
+        f"(first at t = {t[repeated][0]:.3f} s){tell_rounding(stamps, repeated)}",
+    )
+    return rows.take(~repeated)
+
+
+def _drop_held(rows: Table, of: _Sensor) -> Table:
+    """One row of each fix."""
+    new = mask_new_fixes(rows.columns)
+    if new.all():
+        return rows
+    held = format_row_count(~new, of.label)
+    rows = rows.take(new)
+    of.remarks.add("gnss.held", f"{held} with the fix of the row before left out, {len(rows)} kept")
     return rows
 
 
@@ -278,64 +353,3 @@ def check_residuals(rows: Table) -> Array:
             key="gnss.residuals",
         )
     return rms
-
-
-# 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %
-_STEEPEST = 0.1
-
-
-def compute_horizontal_velocity(speed: Array, course: Array, sd: Array) -> tuple[Array, Array, str]:
-    """East-north-up velocities from speed (N,) m/s over ground and course (N,) rad, their sigmas, and notes.
-
-    A stationary receiver may leave the course blank; a blank speed gives no velocity.
-
-    Parameters
-    ----------
-    sd : (N, 3) or (3,), 1-sigma east, north, up, m/s.
-    """
-    sd_v = np.array(np.broadcast_to(sd, (len(speed), 3)), dtype=float)
-    course = np.where(np.isnan(course) & (speed < sd_v[:, 0]), 0.0, course)
-    v = np.stack([speed * np.sin(course), speed * np.cos(course), np.zeros_like(speed)], -1)
-    absent = np.isnan(v).any(-1)
-    typical = np.median(sd_v[~absent] if not absent.all() else sd_v, axis=0)
-    sd_v[:, 2] = np.maximum(sd_v[:, 2], _STEEPEST * np.abs(np.nan_to_num(speed)))
-    v[absent] = sd_v[absent] = np.nan
-    return (
-        v,
-        sd_v,
-        (
-            f"velocity: from speed and course over ground, 1-sigma {typical[0]:g} m/s a horizontal axis; the vertical "
-            f"one is taken as 0 with {typical[2]:g} m/s or a tenth of the speed"
-        ),
-    )
-
-
-_MARKED = ("sd_e", "sd_n", "sd_u", "sd_ve", "sd_vn", "sd_vu", "speed", "course")
-
-
-def blank_unknown(rows: Table) -> tuple[Table, Selection]:
-    """Speeds and courses that a phone does not know made blank, and which rows (N,) have a known position.
-
-    A phone marks an unknown value, or the accuracy of one, by -1 (`CLLocation` of Apple's Core Location); where a
-    column holds other negative values, -1 is one of them.
-
-    Raises
-    ------
-    RecordingError
-        If no position is known.
-    """
-    marks = {name: rows[name] == -1.0 for name in _MARKED if name in rows and (rows[name] < 0.0).any()}
-    marks = {name: some for name, some in marks.items() if not (some ^ (rows[name] < 0.0)).any()}
-    none = np.zeros(len(rows), dtype=bool)
-    unknown = (marks.get("sd_e", none) & marks.get("sd_n", none)) | marks.get("sd_u", none)
-    if len(rows) and unknown.all():
-        raise RecordingError(
-            f"{rows.path}: the accuracy of every fix is -1, a phone's mark of one that it does not have",
-            key="gnss.sigma_all_unknown",
-        )
-    for name in ("sd_ve", "sd_vn", "sd_vu", "speed", "course"):
-        if name in marks:
-            rows = rows.with_column(name, np.where(marks[name], np.nan, rows[name]))
-    if "speed" in rows and "sd_ve" in marks:
-        rows = rows.with_column("speed", np.where(marks["sd_ve"], np.nan, rows["speed"]))
-    return rows, ~unknown

@@ -84,6 +84,10 @@ class Table:
         """The table with one column replaced."""
         return replace(self, columns={**self.columns, name: values})
 
+    def drop(self, *names: str) -> Table:
+        """The table without some columns."""
+        return replace(self, columns={name: column for name, column in self.columns.items() if name not in names})
+
     def describe_place(self, row: int, name: str) -> str:
         """'file, line 12, column lat' for an error about one cell."""
         with _open(self.path) as file:
