@@ -46,24 +46,6 @@ def test_the_error_of_a_lag_is_as_large_as_stated(misfit_lasts: float) -> None:
     assert np.abs(z).max() < 4.5
 
 
-def test_the_error_of_a_lag_is_as_large_as_stated_of_a_drive_that_mostly_stands() -> None:
-    """Speeds are far off while it moves, as by stamps that jitter, and at rest nothing is."""
-    n, late = 80, 0.13
-    t, z = np.arange(n, dtype=float), []
-    for seed in range(100):
-        rng = np.random.default_rng(seed)
-        moved = np.linspace(-10.0, t[-1] + 10.0, 2000)
-        x = rng.normal(size=(2, 1)) * [lasting(rng, len(moved), 40.0) for _ in range(2)] * (moved < 30.0)
-        y = np.interp(t + late, moved, x[0]) + np.where(t < 30.0, 0.7, 0.02) * rng.normal(size=n)
-
-        def x_at(rows: np.ndarray, lag: lags.Lags, moved: np.ndarray = moved, x: np.ndarray = x) -> np.ndarray:
-            return np.stack([np.interp(np.add.outer(lag, t[rows]), moved, one) for one in x], axis=-1)
-
-        lag, spread = lags.refine_lag(t, y, x_at, lambda lag: np.ones(n, dtype=bool), np.arange(n), 0.0, 20)
-        z.append((lag - late) / spread)
-    assert np.sqrt(np.mean(np.square(z))) < 1.5
-
-
 def test_nothing_is_known_of_a_lag_where_nothing_changes() -> None:
     t = 0.2 * np.arange(300)
     y = np.random.default_rng(1).normal(size=300)

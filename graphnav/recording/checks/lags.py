@@ -83,7 +83,8 @@ def refine_lag(
         found = interpolate_at(guess, rows)
         if found is None:
             return guess, LAG_REACH
-        rows = found.rows[mask_inliers(found.x, found.e)]
+        off = np.abs(found.e - np.median(found.e))
+        rows = found.rows[off <= _OUTLYING * np.median(off) / 0.6745]
 
     def compute_profile(lags: Array) -> Array:
         return np.array([np.nan if one is None else one.unexplained for one in interpolate_each(lags, rows)])
@@ -130,20 +131,6 @@ def sample_shared(
         for k, end in itertools.pairwise(begins):
             own = np.flatnonzero(some[k][kept])
             yield rows[kept[own]], x[k:end] if len(own) == len(kept) else x[k:end].take(own, axis=1)
-
-
-def mask_inliers(x: Array, e: Array) -> NDArray[np.bool_]:
-    """(N,) which misfits e (N,) of a regression on x (N, m) are no errors of single fixes.
-
-    Their usual size is the median in which each row counts by its share in the regression: at rest nothing is to be
-    explained, and by the misfits there most of those in motion, which tell the lag, would be errors.
-    """
-    off = np.abs(e - np.median(e))
-    share = np.sum(np.linalg.qr(x - x.mean(0))[0] ** 2, axis=1)
-    order = np.argsort(off)
-    sums = np.cumsum(share[order])
-    usual = off[order[np.searchsorted(sums, 0.5 * sums[-1])]]
-    return np.asarray(off <= _OUTLYING * usual / 0.6745)
 
 
 def regress_each(x: Array, y: Array) -> Array:
