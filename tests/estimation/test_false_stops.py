@@ -17,7 +17,7 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections, detect
 from graphnav.detectors.base import mask_inside, merge_spans
-from graphnav.estimation import building, pipeline
+from graphnav.estimation import building, piece
 from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.pipeline import run
 from graphnav.recording import Recording
@@ -37,7 +37,7 @@ def claim_stops(monkeypatch: pytest.MonkeyPatch, claimed: Array) -> None:
         )
         return Detections(spans, tuple(answers), found.notes)
 
-    for module in (pipeline, building):
+    for module in (piece, building):
         monkeypatch.setattr(module, "detect", claim)
 
 
