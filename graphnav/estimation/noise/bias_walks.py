@@ -6,7 +6,7 @@ would explain any motion. Between the rests before and behind a walk a consumer 
 filter that may not follow bends scale errors and attitude instead.
 
 The steps of expectation-maximisation (`graphnav.estimation.noise.estimate`) do not leave a variance that is too small
-to show in the states. So the likelihood, with the prior of all figures, is climbed by one and two of the
+to show in the states. So the likelihood, with the log-normal prior of all figures, is climbed by one and two of the
 prior's sigmas, as it is flat where a figure is far too small; the maximum is that of the parabola through the highest
 point and its neighbours. What is stated stays where no larger figure is more probable, and where the likelihood would
 have one that no IMU has: then something else is wrong.
@@ -20,7 +20,7 @@ import numpy as np
 
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel, VarianceComponent
-from graphnav.estimation.noise.priors import WITHIN, compute_log_prior, weigh_prior
+from graphnav.estimation.noise.priors import WITHIN
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -44,7 +44,7 @@ def estimate_bias_walks(problem: Problem, about: Points) -> tuple[NoiseModel, Co
             figures = {name: _make_component(k, 1.0) for name, k in zip(_FIGURES, sigmas, strict=True)}
             one = apply_noise(problem, NoiseModel(figures))
             likelihood = refilter(one, about, whole=False).log_likelihood.sum()
-            known[sigmas] = float(likelihood + compute_log_prior(WITHIN * np.array(sigmas), WITHIN).sum())
+            known[sigmas] = float(likelihood) - 0.5 * float(np.sum(np.square(sigmas)))
         return known[sigmas]
 
     def list_steps(*sizes: int) -> list[tuple[int, ...]]:
@@ -59,8 +59,7 @@ def estimate_bias_walks(problem: Problem, about: Points) -> tuple[NoiseModel, Co
     figures = {}
     for name, k, low, high in zip(_FIGURES, at, list_steps(-1), list_steps(1), strict=True):
         if k:
-            least = -(WITHIN**2) * float(weigh_prior(WITHIN * k, WITHIN))  # the prior alone has as much
-            bend = min(climb(low) - 2.0 * climb(at) + climb(high), least)
+            bend = min(climb(low) - 2.0 * climb(at) + climb(high), -1.0)  # the prior alone has as much
             off = 0.5 * (climb(low) - climb(high)) / bend
             figures[name] = _make_component(k + float(np.clip(off, -0.5, 0.5)), float((-bend) ** -0.5))
     return NoiseModel(figures) if figures else STATED, Counter(filter=len(known))

@@ -10,7 +10,7 @@ import numpy as np
 from graphnav.constraints.lasting import LASTING
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
-from graphnav.estimation.noise.priors import compute_log_prior, get_prior, list_largest, weigh_prior
+from graphnav.estimation.noise.priors import get_prior, list_largest
 from graphnav.estimation.problem import Problem
 from graphnav.imu.dynamics import PRIORS
 from graphnav.imu.preintegration import NOISE_FIGURES
@@ -56,8 +56,7 @@ class Components:
         for name, x in self.log.items():
             m, s = self.get_prior(name)
             sigma = self.sigmas.get(name, s)
-            freedom = 2.0 * (sigma**-2.0 - float(weigh_prior(x - m, s)))
-            figures[name] = VarianceComponent(x, sigma, m, s, max(freedom, 0.0))
+            figures[name] = VarianceComponent(x, sigma, m, s, max(2.0 * (sigma**-2.0 - s**-2.0), 0.0))
         return NoiseModel(figures, dict(self.times), dict(self.weights), self.excluded, tails=dict(self.tails))
 
     def get_prior(self, name: str) -> tuple[float, float]:
@@ -72,8 +71,7 @@ class Components:
 
     def log_prior(self) -> float:
         """The logarithm of their prior, up to a constant."""
-        median, scale = np.array([self.get_prior(name) for name in self.log]).T
-        return float(np.sum(compute_log_prior(np.array(list(self.log.values())) - median, scale)))
+        return -0.5 * sum(((x - m) / s) ** 2 for name, x in self.log.items() for m, s in [self.get_prior(name)])
 
     def doubt_wheels(self, problem: Problem) -> None:
         """Begin with what rests on wheels that do not slip as bad as its prior's 1-sigma makes it.
@@ -124,7 +122,7 @@ class Components:
         off, weight, L = np.empty(len(place)), np.empty(len(place)), np.eye(len(place))
         for name, j in place.items():
             m, s = self.get_prior(name)
-            off[j], weight[j] = self.log[name] - m, weigh_prior(self.log[name] - m, s)
+            off[j], weight[j] = self.log[name] - m, s**-2.0
             if m != get_prior(name)[0]:  # it goes with the white part
                 L[j, place[_get_white(name)]] = -1.0
         return -L.T @ (weight * off), L.T @ (weight[:, None] * L)

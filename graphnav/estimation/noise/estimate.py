@@ -1,6 +1,6 @@
 """All noise figures of a recording at once, by the likelihood of its innovations.
 
-Maximum a posteriori: with L the innovation log-likelihood of the filter and a prior on the logarithm of every variance
+Maximum a posteriori: with L the innovation log-likelihood of the filter and a log-normal prior on every variance
 factor, the estimate maximises L plus the logarithm of the priors. In each pass, filter and smoother linearised at the
 points that the pass before left give every factor's redundancy B and sum of squares A
 (`graphnav.estimation.noise.moments`), the gradient (A - B) / 2, and the average information of all
@@ -33,7 +33,7 @@ from graphnav.estimation.noise.initial_points import Initial, find_initial_point
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import ImuMoments, Moments, collect_moments, lag_moments
 from graphnav.estimation.noise.outliers import compute_interval_cost, compute_row_costs, list_reduced
-from graphnav.estimation.noise.priors import TIME_WITHIN, compute_log_prior
+from graphnav.estimation.noise.priors import TIME_WITHIN
 from graphnav.estimation.noise.tails import CHANCE, compute_bounded_mean, estimate_tail_index, find_peak, weigh_scaled
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.breakdown import BREAKDOWN
@@ -377,7 +377,7 @@ def _improve_time(figures: Components, chain: ParameterChain, observed: Array, l
     groups = dict.fromkeys(group for group, known in zip(p.noise_groups, observed, strict=True) if known)
     for group in groups:
         m, s = figures.get_prior(group)
-        value += compute_log_prior(figures.log[group] + np.log(grown) - m, s)
+        value -= 0.5 * ((figures.log[group] + np.log(grown) - m) / s) ** 2
     off, most = np.log(p.correlation_time / median), np.log(_TIME_RANGE)
     low, high = max(_TIME_GRID[0], -most - off), min(_TIME_GRID[-1], most - off)
     x = float(np.clip(_RELAXATION * find_peak(_TIME_GRID, value), low, high))

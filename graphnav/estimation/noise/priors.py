@@ -1,10 +1,8 @@
-"""Priors of the variance factors: a median, and Student's t of the logarithm.
+"""Priors of the variance factors: log-normal, with a median and a 1-sigma of the logarithm.
 
 A stated figure holds within a factor of three either way (1-sigma): data sheets give the sensor on a bench and not in a
 car, receivers print sigmas for the whole of an error or for its noise alone. It is the same for all sensors, so that
 none is favoured; with tens of degrees of freedom in the data the prior has no weight, with none it is used as it is.
-Some figures are wrong by a factor of a hundred. To a normal distribution of the logarithm that is impossible, and it
-would pull the estimate back; so its tails are those of Student's t.
 
 A receiver's sigma is meant to hold for the whole of its error. What part of that is white is not stated: the medians
 of the processes give it half to hours, half to minutes, and a quarter to seconds, in units of the stated variance, and
@@ -20,8 +18,7 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.estimation.faults.watch import SIZES
 
-WITHIN = 2.0 * np.log(3.0)  # scale of the logarithm of a variance: a factor of three in sigma
-FREEDOM = 6.0  # of Student's t: the likeliest for the figures of all recordings, 5 to 8 without any of them
+WITHIN = 2.0 * np.log(3.0)  # 1-sigma of the logarithm of a variance: a factor of three in sigma
 _SHARES = {"seconds": 0.25, "minutes": 0.5, "hours": 0.5, "multipath": 0.25}  # of a GNSS sensor's stated variance
 _OF_RECEIVER = "gnss", "dual_antenna"
 TIME_WITHIN = np.log(3.0)  # 1-sigma of the logarithm of a correlation time
@@ -33,20 +30,6 @@ def get_prior(group: str) -> tuple[float, float]:
     shares = _SHARES if parts[0].startswith(_OF_RECEIVER) else {}
     share = next((shares[part] for part in parts if part in shares), 1.0)
     return float(np.log(share)), WITHIN
-
-
-def weigh_prior(off: Array | float, scale: Array | float) -> Array | float:
-    """Minus the slope of the logarithm of a prior, over how far a logarithm is off its median.
-
-    As a curvature, too, it makes a step that never overshoots (Lange, Little and Taylor 1989, "Robust statistical
-    modeling using the t distribution").
-    """
-    return (FREEDOM + 1.0) / (FREEDOM * scale**2 + off**2)
-
-
-def compute_log_prior(off: Array, scale: Array | float) -> Array:
-    """The logarithms of priors, up to a constant, where logarithms are so far off their medians."""
-    return np.asarray(-0.5 * (FREEDOM + 1.0) * np.log1p((off / scale) ** 2 / FREEDOM))
 
 
 def list_largest(rows: Constraint) -> dict[str, float]:
