@@ -63,7 +63,6 @@ class Constant:
 
 CONSTANTS = (
     Constant(f"{NOISE}.priors", "WITHIN", "data sheets and receivers: right within a factor of three"),
-    Constant(f"{NOISE}.priors", "FREEDOM", "tails of that: the likeliest for the figures of all recordings"),
     Constant(f"{NOISE}.priors", "TIME_WITHIN", "the same of correlation times"),
     Constant(f"{NOISE}.priors", "_SHARES", "lasting parts of a stated variance: as much as the whole, all together"),
     Constant(f"{NOISE}.tails", "CHANCE", "probability of an outlier", 10.0),
