@@ -166,7 +166,7 @@ def plan(options: argparse.Namespace) -> list[Job]:
         source = placed(DRIVES[name], options.data)
         recording = load(source)
         for window, span in windows(recording, DRIVES[name].source, options):
-            sets = SENSORS if recording.odometer is not None else SENSORS[:2]
+            sets = SENSORS if recording.odometer is not None or options.changed == "obd" else SENSORS[:2]
             cells += [
                 [Job(name, source, window, span, sensors, v, options.online, options.changed) for v in VARIANTS]
                 for sensors in sets
@@ -212,7 +212,7 @@ def solve(job: Job) -> list[Row]:
             seconds = time.process_time() - began
             metrics = score(reference, used, solutions, withheld)[0]
             out = {
-                name: {**left_out(used, one.excluded, one.records["gnss_position"]), "seconds": round(seconds, 2)}
+                name: {**left_out(used, one.excluded, one.records.get("gnss_position")), "seconds": round(seconds, 2)}
                 for name, one in solutions.items()
             }
         else:

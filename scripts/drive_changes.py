@@ -10,7 +10,7 @@ import numpy as np
 
 import graphnav
 from graphnav.core import rotation
-from graphnav.core.earth import LocalFrame
+from graphnav.core.earth import A, LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Odometer, Recording, take_rows
 
@@ -25,7 +25,7 @@ _COLD, _WARMS = (np.radians(0.2), 0.06), 100.0  # rad/s and m/s^2 of every axis 
 _OBD_RATE, _OBD_LATE, _OBD_HIGH = 2.0, 0.3, 1.02  # Hz, s
 _WANDER, _WANDER_TIME = np.array([2.0, 2.0, 5.0]), 60.0  # m, s
 _TUNNEL, _EDGE, _ASTRAY = 60.0, 5.0, 30.0  # s, s, m
-_PARKED, _SETTLES, _AT_FIRST = 60.0, 15.0, 10.0  # s, s, stated sigmas
+_PARKED, _SETTLES, _AT_FIRST = 60.0, 15.0, 4.0  # s, s, stated sigmas
 _BURST_EVERY, _BURST_LASTS, _BURST_OFF = 40.0, (1.0, 6.0), (10.0, 60.0)  # s, s, m
 _DIGITS = np.array([np.radians(1e-5), np.radians(1e-5), 1.0])  # rad, rad, m
 _ROUGH = 0.04  # m/s^2 and rad/s per 100, of a row, per m/s
@@ -216,7 +216,9 @@ def reflect(recording: Recording) -> Recording:
 def round_fixes(recording: Recording) -> Recording:
     """The drive with fixes of few digits: 1e-5 deg and whole metres; their velocities and sigmas as before."""
     gnss = _gnss(recording)
-    return replace(recording, gnss=replace(gnss, llh=np.round(gnss.llh / _DIGITS) * _DIGITS))
+    e, n, u = A * _DIGITS[1] * np.cos(gnss.llh[0, 0]), A * _DIGITS[0], _DIGITS[2]
+    rounding = tuple((np.array([e, n, u]) / np.sqrt(12.0)).tolist())
+    return replace(recording, gnss=replace(gnss, llh=np.round(gnss.llh / _DIGITS) * _DIGITS, rounding=rounding))
 
 
 def hold_fixes(recording: Recording) -> Recording:
