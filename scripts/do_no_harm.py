@@ -270,7 +270,7 @@ def left_out(recording: Recording, excluded: Iterable[ExcludedSpan], record: Con
     velocities = sum(fault.count for fault in excluded if fault.kind == "gnss_velocity")
     found: Row = {"fixes": int(there.sum()), "left_out": int(out.sum()), "left_out_velocities": velocities}
     reference = find_truth(recording)
-    if reference is None:
+    if reference is None or not there.any():
         return found | {"confirmed": None, "confirmed_left_out": None}
     truth, of_antenna = reference[0], reference[1] is not None
     arm = None if of_antenna or not gnss.lever_arm.any() else gnss.lever_arm
