@@ -96,6 +96,20 @@ def are_covered(spans: Iterable[Span], by: list[Span]) -> bool:
     return all(any(a <= begin and end <= b for a, b in by) for begin, end in spans)
 
 
+def move_end(spans: list[Span], i: int, side: int, step: int, t: Array) -> list[Span]:
+    """Spans with the begin (`side` 0) or the end (1) of one at a later measurement, of those at times t (N,), s.
+
+    Empty where there is none, where it is in another span, or where none is left between begin and end.
+    """
+    at = int(np.searchsorted(t, spans[i][side] - SAME_TIME)) + step
+    if not 0 <= at < len(t):
+        return []
+    moved = [*spans]
+    moved[i] = (float(t[at]), spans[i][1]) if side == 0 else (spans[i][0], float(t[at]))
+    begins, ends = np.array(moved).T
+    return moved if np.all(begins <= ends) and np.all(begins[1:] > ends[:-1] + SAME_TIME) else []
+
+
 def list_before(spans: list[Span], t: Array) -> list[Span]:
     """As long before each of some spans, as far as it overlaps none of them and has measurements at times t (N,), s."""
     ends = [-np.inf, *(end for _, end in spans[:-1])]

@@ -1,4 +1,4 @@
-"""Spans of fixes that are suspected; `graphnav.estimation.noise.exclusion` decides on them."""
+"""Spans of fixes that are suspected, and how they are dated; `graphnav.estimation.noise.exclusion` decides on them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
 from graphnav.estimation.faults.segments import find_wrong_segments
-from graphnav.estimation.faults.watch import FAULT_COST, SIZES
+from graphnav.estimation.faults.watch import FAULT_COST, PATIENCE, SIZES
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import NoiseEstimate
 from graphnav.estimation.noise.explanations import FIXES
@@ -26,6 +26,8 @@ from graphnav.estimation.noise.spans import (
 )
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
+
+_STEPS = 8  # fixes by which the ends of spans are varied
 
 
 def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
@@ -57,6 +59,22 @@ def find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) ->
     used = apply_noise(base, replace(found.noise, excluded={}))
     segments = find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
     return [] if are_covered(segments, within) else segments, 1
+
+
+def date_segments(base: Problem, found: NoiseEstimate, spans: list[Span]) -> list[Span]:
+    """Wrong segments near some spans, dated to the fix: the errors of a drift date its onset together.
+
+    Parameters
+    ----------
+    found : without the spans.
+    """
+    t, edges = list_fix_times(base), set[int]()
+    for begin, end in spans:
+        steps = _STEPS if end - begin > PATIENCE else 0  # a short one is left out whole
+        for at in np.searchsorted(t, [begin - SAME_TIME, end + SAME_TIME]).tolist():
+            edges |= set(range(max(at - steps, 0), min(at + steps + 1, len(t))))
+    used = apply_noise(base, replace(found.noise, excluded={}))
+    return find_wrong_segments(used, found.carry_points(base, used), t[sorted(edges)].tolist(), FIXES)
 
 
 def predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:
